@@ -1,0 +1,328 @@
+"""One physics contract, three engines behind it.
+
+| engine   | where         | what it is                                                                        |
+|----------|---------------|-----------------------------------------------------------------------------------|
+| `mujoco` | CPU           | MuJoCo's C engine on a thread pool, one `jax.pure_callback` per control step      |
+| `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes                      |
+| `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                                           |
+
+Signatures are those of one environment; batches come from `jax.vmap`, nested as one likes.
+
+Example:
+  >>> import mujoco
+  >>> from envs import physics
+  >>> model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>')
+  >>> engine = physics.make_engine(model, substeps=5, readout={"position": ("xpos", 1)}, physics="mujoco")
+  >>> state, out = engine.step(engine.start(), jax.numpy.zeros(0))
+  >>> out["position"].shape
+  (3,)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import importlib
+import importlib.metadata
+import importlib.util
+import io
+import os
+import threading
+from collections.abc import Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .errors import TaskError, one_of
+
+ENGINES = ("mjx", "mujoco", "warp")
+SOLVERS = ("converged", "fast")
+MUJOCO_SERIES = "3.17"  # RK4, contact margins and MJX's private hooks differ between minor versions
+
+
+def check_versions() -> None:
+    """Refuses versions that are known to compute something else or to hang.
+
+    Raises:
+      TaskError: mujoco and mujoco-mjx are not the same 3.17.*, or jax is 0.10.*.
+    """
+    found = {name: _version(name) for name in ("mujoco", "mujoco-mjx")}
+    right = all(v is not None and v.startswith(MUJOCO_SERIES + ".") for v in found.values())
+    if not right or len(set(found.values())) != 1:
+        listing = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
+        pip = f"pip install 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
+        raise TaskError(f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {pip}")
+    if jax.__version__.startswith("0.10."):
+        raise TaskError(f"jax {jax.__version__} deadlocks on CPUs; pip install 'jax>=0.9.2,!=0.10.*'")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+check_versions()
+import mujoco  # noqa: E402  (after the check: a missing MuJoCo gets the sentence above, not a traceback)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PhysicsState:
+    """All that one control step needs to know of the last one.
+
+    Attributes:
+      qpos: [nq] positions in MuJoCo's order and units.
+      qvel: [nv] velocities.
+      warmstart: [nv] the acceleration the constraint solver starts from.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+
+
+Readout = Mapping[str, tuple[str, Any]]  # name -> (field of mjData, index into its first axis)
+
+
+class Engine(Protocol):
+    """A model and the means to advance it."""
+
+    name: str
+
+    def start(self) -> PhysicsState:
+        """The model's reference position at rest."""
+        ...
+
+    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        """One control step of `substeps` integration steps under the constant `ctrl` [nu].
+
+        Returns:
+          The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
+          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`.
+        """
+        ...
+
+
+def make_engine(
+    model: mujoco.MjModel,
+    *,
+    substeps: int,
+    readout: Readout,
+    physics: str = "auto",
+    solver: str = "converged",
+    fast_contacts: Collection[str] = (),
+    threads: int | None = None,
+) -> Engine:
+    """Builds an engine for a model.
+
+    Args:
+      model: a compiled model; it is copied, never changed.
+      substeps: integration steps in a control step.
+      readout: derived arrays to return, e.g. `{"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}`.
+      physics: `auto` or one of `ENGINES`; `auto` takes the fastest for the device (`engine.name` says which).
+      solver: `converged` keeps the model's solver settings; `fast` cuts Newton to 4 iterations of 8 line-search steps
+        and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors
+        grow to 1e-3.
+      fast_contacts: names of the geoms that keep their contacts when the solver is fast; empty keeps all.
+      threads: of the `mujoco` engine; the process's usable CPUs where None.
+
+    Raises:
+      TaskError: unknown engine or solver, or an engine that cannot run here.
+    """
+    physics = resolve(physics)
+    one_of("solver", solver, SOLVERS)
+    if model.na or model.nmocap:
+        raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
+    model = copy.copy(model)
+    if solver == "fast":
+        _cut_solver(model, fast_contacts)
+    if physics == "mujoco":
+        return CEngine(model, substeps, readout, threads)
+    return XlaEngine(model, substeps, readout)
+
+
+def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
+    model.opt.iterations, model.opt.ls_iterations = 4, 8
+    for geom in range(model.ngeom):
+        if keep and model.geom(geom).name not in keep:
+            model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
+
+
+def resolve(physics: str) -> str:
+    """The engine that `physics` means on this machine."""
+    one_of("physics", physics, ("auto", *ENGINES))
+    if physics != "auto":
+        return physics
+    return "mujoco" if jax.default_backend() == "cpu" else "mjx"
+
+
+def usable_cpus() -> int:
+    """CPUs this process may run on, which in a container are fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# MuJoCo's C engine
+
+
+class CEngine:
+    """MuJoCo's C engine on a thread pool."""
+
+    name = "mujoco"
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None):
+        # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self._model = model
+        self._substeps = substeps
+        self._readout = dict(readout)
+        self._threads = threads or usable_cpus()
+        self._idle: list[_Worker] = []
+        self._out_shapes = self._probe()
+
+    def start(self) -> PhysicsState:
+        return _start(self._model)
+
+    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        dtype = state.qpos.dtype
+        packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(dtype)])
+        width = sum(int(np.prod(shape)) for shape in self._out_shapes.values())
+        result = jax.ShapeDtypeStruct((width,), dtype)
+        flat = jax.pure_callback(self._advance, result, packed, vmap_method="broadcast_all")
+        parts, at = {}, 0
+        for name, shape in self._out_shapes.items():
+            size = int(np.prod(shape))
+            parts[name] = flat[at : at + size].reshape(shape)
+            at += size
+        state = PhysicsState(parts.pop("qpos"), parts.pop("qvel"), parts.pop("warmstart"))
+        return state, {name: parts[f"out:{name}"] for name in self._readout}
+
+    def _probe(self) -> dict[str, tuple[int, ...]]:
+        worker = _Worker(self._model, self._substeps, self._readout)
+        self._idle.append(worker)
+        return worker.out_shapes
+
+    def _advance(self, packed: Any) -> np.ndarray:
+        """The host's side: packed [..., nq + 2 nv + nu] in, [..., outputs] out."""
+        packed = np.asarray(packed)
+        rows = packed.reshape(-1, packed.shape[-1])
+        width = sum(int(np.prod(shape)) for shape in self._out_shapes.values())
+        out = np.full((len(rows), width), np.nan, rows.dtype)
+        # Rows that are broken already stay broken; C would complain about them in MUJOCO_LOG.TXT.
+        sound = np.flatnonzero(np.isfinite(rows).all(axis=1)).tolist()
+        # The threads draw from one iterator (atomic in CPython), so a slow thread delays nobody.
+        queue = iter(sound)
+        helpers = []
+        for _ in range(min(self._threads, len(sound)) - 1):
+            try:
+                helpers.append(_pool(self._threads).submit(self._work, queue, rows, out))
+            except RuntimeError:  # the interpreter is shutting down and takes no new work: do it all here
+                break
+        self._work(queue, rows, out)
+        for helper in helpers:
+            helper.result()
+        return out.reshape(*packed.shape[:-1], width)
+
+    def _work(self, queue: Iterator[int], rows: np.ndarray, out: np.ndarray) -> None:
+        try:
+            worker = self._idle.pop()
+        except IndexError:
+            worker = _Worker(self._model, self._substeps, self._readout)
+        for row in queue:
+            worker.advance(rows[row], out[row])
+        self._idle.append(worker)
+
+
+class _Worker:
+    """One thread's mjData, with the array views that are read and written every control step."""
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
+        self._model, self._substeps = model, substeps
+        self._data = data = mujoco.MjData(model)
+        self._post_constraint = any(field in ("cfrc_ext", "cfrc_int", "cacc") for field, _ in readout.values())
+        for warning in data.warning:
+            warning.number = 1  # C reports the first of each kind only, into MUJOCO_LOG.TXT of the working directory
+        # [Only views: mjData owns the memory.]
+        self._inputs = _views([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl])
+        outputs = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart}
+        for name, (field, index) in readout.items():
+            outputs[f"out:{name}"] = getattr(data, field)[index]
+        self.out_shapes = {name: view.shape for name, view in outputs.items()}
+        self._outputs = _views([view.reshape(-1) for view in outputs.values()])
+
+    def advance(self, row: np.ndarray, out: np.ndarray) -> None:
+        """One control step of one environment: row [inputs] to out [outputs]."""
+        data = self._data
+        for view, part in self._inputs:
+            view[:] = row[part]
+        data.time = 0.0
+        mujoco.mj_step(self._model, data, self._substeps)
+        if self._post_constraint:
+            mujoco.mj_rnePostConstraint(self._model, data)
+        for view, part in self._outputs:
+            out[part] = view
+
+
+def _views(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
+    """Each array with its place in their concatenation."""
+    ends = np.cumsum([a.size for a in arrays]).tolist()
+    return [(a, slice(end - a.size, end)) for a, end in zip(arrays, ends, strict=True)]
+
+
+_POOLS: dict[int, ThreadPoolExecutor] = {}
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """One pool for all engines with that many threads; the calling thread works too, hence one fewer."""
+    if threads not in _POOLS:
+        _POOLS[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="pmt-physics")
+    return _POOLS[threads]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_POOLS.clear)  # threads do not survive a fork; the child starts its own
+
+
+def _start(model: mujoco.MjModel) -> PhysicsState:
+    dtype = jnp.result_type(float)
+    zeros = jnp.zeros(model.nv, dtype)
+    return PhysicsState(jnp.asarray(model.qpos0, dtype), zeros, zeros)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# MJX
+
+
+def _import_mjx() -> Any:
+    """`mujoco.mjx`, without what it prints when the optional warp is missing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return importlib.import_module("mujoco.mjx")
+
+
+_TRACING = threading.RLock()
+
+
+class XlaEngine:
+    """MJX."""
+
+    name = "mjx"
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
+        mjx = _import_mjx()
+        self._c_model = model
+        self._substeps, self._readout = substeps, dict(readout)
+        with jax.ensure_compile_time_eval():
+            self._model = mjx.put_model(model, impl="jax")
+            self._data = mjx.make_data(self._model)
+
+    def start(self) -> PhysicsState:
+        return _start(self._c_model)
+
+    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        raise NotImplementedError
