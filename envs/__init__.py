@@ -1,0 +1,56 @@
+"""Tasks with rewards and costs, as pure functions of arrays.
+
+`make(name, **options)` builds one, `names()` lists them. Importing this package imports neither JAX nor MuJoCo.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from typing import TYPE_CHECKING, Any
+
+from .errors import TaskError, did_you_mean
+
+if TYPE_CHECKING:
+    from .base import Env
+
+__pmt__ = "pmt-jax"  # tells our `envs` from the unrelated package of that name on PyPI
+
+# name -> (module, class, the options that make this task of it)
+_TASKS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "ant_2x4": ("ant_corridor", "AntCorridor", {"num_agents": 2}),
+    "ant_4x2": ("ant_corridor", "AntCorridor", {"num_agents": 4}),
+    "lane": ("toys", "Lane", {}),
+    "switch": ("toys", "Switch", {}),
+    "noisy": ("toys", "Noisy", {}),
+}
+
+
+def names() -> list[str]:
+    """The tasks `make` knows."""
+    return sorted(_TASKS)
+
+
+def make(name: str, **options: Any) -> Env:
+    """Builds a task.
+
+    Args:
+      name: one of `names()`.
+      **options: the task's own options, e.g. `physics="mjx"`; see the task's class.
+
+    Raises:
+      TaskError: unknown name or option (the nearest known one is named), or an engine that cannot run here.
+
+    Example:
+      >>> make("lane").spec.num_agents
+      2
+    """
+    if name not in _TASKS:
+        raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
+    module, class_name, fixed = _TASKS[name]
+    cls = getattr(importlib.import_module(f".{module}", __name__), class_name)
+    known = [p for p in inspect.signature(cls).parameters if p not in fixed]
+    for option in options:
+        if option not in known:
+            raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
+    return cls(**fixed, **options)

@@ -1,0 +1,140 @@
+"""Three constrained tasks small enough for their optimum to be known: the learner's proving ground.
+
+Two agents with two actions each share reward and cost; an episode has 25 steps and never terminates.
+
+| task | dynamics | reward | cost | optimum at limit 0 / at its limit / unconstrained (its cost) |
+|---|---|---|---|---|
+| `lane` | y' = 0.8 y + 0.2 sum_i mean(a_i) | 1 - (y' - 1)^2 | y' > 0.5 | 18.64 / 18.85 / 24.561 (24) |
+| `switch` | none | 1 - (a_00 - 0.9)^2 - 0.1 sum_others (a - 0.5)^2 | abs(a_00) > 0.3 | 16 / 16.36 / 25 (25) |
+| `noisy` | as `lane` | as `lane` | y' > 0.5, with probability 0.3 | as `lane`, the cost of a step beyond is 0.3 in the mean |
+
+`lane` has a cost of the state, like the ant; `switch` a cost of the action alone, like the hands; `noisy` a cost that
+must be appraised before it can be avoided.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .base import EnvSpec, State
+
+HORIZON = 25
+NUM_AGENTS = 2
+ACTION_DIM = 2
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Carry:
+    """position [], time [] int32 (steps since reset), key: what the next step's noise is drawn from."""
+
+    position: jax.Array
+    time: jax.Array
+    key: jax.Array
+
+
+class Lane:
+    """The team steers one point along a line: the goal is at 1, the danger begins at 0.5."""
+
+    name = "lane"
+    cost_limit = 1.0
+    engine = "xla"
+
+    def __init__(self) -> None:
+        self.spec = EnvSpec(
+            name=self.name,
+            num_agents=NUM_AGENTS,
+            obs_dim=2 + NUM_AGENTS * ACTION_DIM + NUM_AGENTS,
+            action_dim=ACTION_DIM,
+            state_dim=2 + NUM_AGENTS * ACTION_DIM,
+            num_costs=1,
+            horizon=HORIZON,
+            action_mask=np.ones((NUM_AGENTS, ACTION_DIM), np.float32),
+            cost_limit=self.cost_limit,
+        )
+
+    def reset(self, key: jax.Array) -> State:
+        return self.restore(position=0.0, time=0, last_action=jnp.zeros((NUM_AGENTS, ACTION_DIM)), key=key)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        action = jnp.clip(action, -1.0, 1.0)
+        key, noise_key = jax.random.split(state.carry.key)
+        position = self._get_position(state.carry.position, action)
+        carry = Carry(position, state.carry.time + 1, key)
+        return self._state(
+            carry,
+            action,
+            reward=self._get_reward(position, action),
+            cost=self._get_cost(position, action, noise_key).astype(position.dtype),
+        )
+
+    def restore(self, position: Any, time: Any, last_action: Any, key: Any = None) -> State:
+        """The state at `position` [] after `time` [] steps, where `last_action` [N, A] was the last joint action."""
+        carry = Carry(
+            jnp.asarray(position, float), jnp.asarray(time, jnp.int32), jax.random.key(0) if key is None else key
+        )
+        zero = jnp.zeros_like(carry.position)
+        return self._state(carry, jnp.asarray(last_action, float), reward=zero, cost=zero)
+
+    def raw(self, state: State) -> dict[str, Any]:
+        last_action = state.global_state[1:-1].reshape(NUM_AGENTS, ACTION_DIM)
+        return {**vars(state.carry), "last_action": last_action}
+
+    def _state(self, carry: Carry, last_action: jax.Array, reward: jax.Array, cost: jax.Array) -> State:
+        time = carry.time / jnp.asarray(HORIZON, carry.position.dtype)
+        seen = jnp.concatenate([(2 * carry.position - 1)[None], last_action.ravel(), time[None]])
+        agent_id = jnp.eye(NUM_AGENTS, dtype=seen.dtype)
+        return State(
+            obs=jnp.concatenate([jnp.broadcast_to(seen, (NUM_AGENTS, seen.size)), agent_id], axis=1),
+            global_state=seen,
+            reward=reward,
+            cost=jnp.broadcast_to(cost, (NUM_AGENTS, 1)),
+            terminated=jnp.asarray(False),
+            info={"position": carry.position},
+            carry=carry,
+        )
+
+    def _get_position(self, position: jax.Array, action: jax.Array) -> jax.Array:
+        return 0.8 * position + 0.2 * jnp.sum(jnp.mean(action, axis=-1))
+
+    def _get_reward(self, position: jax.Array, action: jax.Array) -> jax.Array:
+        del action
+        return 1 - (position - 1) ** 2
+
+    def _get_cost(self, position: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        del action, key
+        return position > 0.5
+
+
+class Switch(Lane):
+    """The best action of agent 0's first actuator is 0.9; beyond 0.3 it costs. Nothing moves."""
+
+    name = "switch"
+
+    def _get_position(self, position: jax.Array, action: jax.Array) -> jax.Array:
+        del action
+        return position
+
+    def _get_reward(self, position: jax.Array, action: jax.Array) -> jax.Array:
+        del position
+        others = action.ravel()[1:]
+        return 1 - (action[0, 0] - 0.9) ** 2 - 0.1 * jnp.sum((others - 0.5) ** 2)
+
+    def _get_cost(self, position: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        del position, key
+        return jnp.abs(action[0, 0]) > 0.3
+
+
+class Noisy(Lane):
+    """`lane` whose danger strikes only three times in ten: the cost signal is mostly noise, fear should not be."""
+
+    name = "noisy"
+    cost_limit = 0.5
+
+    def _get_cost(self, position: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        return super()._get_cost(position, action, key) & jax.random.bernoulli(key, 0.3)

@@ -1,0 +1,131 @@
+"""Batch, time limit, auto-reset and quarantine: the one place that knows about the ends of episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .base import Env, EnvSpec, State
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class VectorState:
+    """B environments, each at the moment before its next action.
+
+    Attributes:
+      env: State with a leading [B].
+      elapsed: [B] int32, steps since the last reset.
+      episode: [B] int32, resets so far; with `key` it names the randomness of the next one.
+      key: [B] one key per environment, never used twice.
+    """
+
+    env: State
+    elapsed: jax.Array
+    episode: jax.Array
+    key: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one step brought, before any reset.
+
+    Attributes:
+      reward: [B]; cost: [B, N, K]; info: {name: [B]}.
+      terminated: [B] bool, ended by the task's rule (or by broken physics): nothing lies beyond.
+      truncated: [B] bool, cut by the time limit: bootstrap from the next state. Never both.
+      next_obs, next_global_state: [B, N, O], [B, S] the true next observation and state.
+      non_finite: [B] bool, the step was not finite and has been replaced (see `VectorEnv.step`).
+    """
+
+    reward: jax.Array
+    cost: jax.Array
+    info: dict[str, jax.Array]
+    terminated: jax.Array
+    truncated: jax.Array
+    next_obs: jax.Array
+    next_global_state: jax.Array
+    non_finite: jax.Array
+
+
+class VectorEnv:
+    """`num_envs` copies of an environment with a time limit and auto-reset.
+
+    Example:
+      >>> import envs, jax
+      >>> vector = VectorEnv(envs.make("lane"), num_envs=4)
+      >>> state = vector.reset(jax.random.key(0))
+      >>> state, outcome = vector.step(state, jax.numpy.zeros((4, 2, 2)))
+      >>> outcome.reward.shape
+      (4,)
+    """
+
+    def __init__(self, env: Env, num_envs: int, horizon: int | None = None) -> None:
+        self.env = env
+        self.num_envs = num_envs
+        self.horizon = horizon or env.spec.horizon
+
+    @property
+    def spec(self) -> EnvSpec:
+        return self.env.spec
+
+    def reset(self, key: jax.Array) -> VectorState:
+        """Fresh episodes in all environments."""
+        key = jax.random.split(key, self.num_envs)
+        episode = jnp.zeros(self.num_envs, jnp.int32)
+        env = jax.vmap(self.env.reset)(jax.vmap(jax.random.fold_in)(key, episode))
+        return VectorState(env, jnp.zeros_like(episode), episode, key)
+
+    def step(self, state: VectorState, action: jax.Array) -> tuple[VectorState, Outcome]:
+        """Applies `action` [B, N, A]; environments that end are reset with a key they never used before.
+
+        A step that leaves anything non-finite (or started from it) is quarantined: the episode terminates, its last
+        step counts reward 0 and cost 1, the last finite observation stands in for the next one, and `non_finite` says so.
+        """
+        before = state.env
+        after = jax.vmap(self.env.step)(before, action)
+        bad = ~_finite(after)
+        terminated = after.terminated | bad
+        elapsed = state.elapsed + 1
+        truncated = (elapsed >= self.horizon) & ~terminated
+        outcome = Outcome(
+            reward=jnp.where(bad, 0, after.reward),
+            cost=_where(bad, jnp.ones_like(after.cost), after.cost),
+            info=_where(bad, before.info, after.info),
+            terminated=terminated,
+            truncated=truncated,
+            next_obs=_where(bad, before.obs, after.obs),
+            next_global_state=_where(bad, before.global_state, after.global_state),
+            non_finite=bad,
+        )
+        done = terminated | truncated
+        episode = state.episode + done
+        env = self._restart(done, after, jax.vmap(jax.random.fold_in)(state.key, episode))
+        return VectorState(env, jnp.where(done, 0, elapsed), episode, state.key), outcome
+
+    def _restart(self, done: jax.Array, env: State, key: jax.Array) -> State:
+        # Resets are rare, so a batch without one skips the work (under an outer vmap over seeds both sides run).
+        return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(self.env.reset)(key), env), lambda: env)
+
+
+def _finite(state: State) -> jax.Array:
+    """[B] bool: every floating number of an environment's state is finite."""
+    checks = [
+        jnp.isfinite(x).reshape(x.shape[0], -1).all(axis=1)
+        for x in jax.tree.leaves(state)
+        if jnp.issubdtype(x.dtype, jnp.floating)
+    ]
+    return jnp.stack(checks).all(axis=0)
+
+
+def _where(mask: jax.Array, chosen: Any, otherwise: Any) -> Any:
+    """Per environment, `chosen` where `mask` [B], else `otherwise`; for any pytree with leading [B]."""
+
+    def select(x: jax.Array, y: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
+
+    return jax.tree.map(select, chosen, otherwise)

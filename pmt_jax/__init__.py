@@ -1,0 +1,37 @@
+"""Safe multi-agent reinforcement learning with emotions, as one compiled program.
+
+Everything public is reached from here; importing the package imports neither JAX nor MuJoCo until something is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .config import Config, load_config
+    from .evaluate import evaluate
+    from .learner import init, make_train, setup, train_step
+    from .methods import METHODS, Method
+
+__version__ = "0.1.0"
+
+_PLACES = {
+    "Config": "config",
+    "METHODS": "methods",
+    "Method": "methods",
+    "evaluate": "evaluate",
+    "init": "learner",
+    "load_config": "config",
+    "make_train": "learner",
+    "setup": "learner",
+    "train_step": "learner",
+}
+
+__all__ = ["METHODS", "Config", "Method", "evaluate", "init", "load_config", "make_train", "setup", "train_step"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'pmt_jax' has no attribute '{name}'")
+    return getattr(importlib.import_module(f".{_PLACES[name]}", __name__), name)

@@ -1,0 +1,293 @@
+"""Settings of a run: one flat frozen dataclass, TOML in, TOML out, no JAX.
+
+`Hyper` holds the numbers that may differ between runs of one compiled program; `Config` adds everything static.
+A file in `configs/` holds what all methods of a task share, then a `[method.NAME]` table of what differs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pathlib
+import re
+import tomllib
+import types
+import typing
+from typing import Any, Literal
+
+from .errors import UsageError
+from .methods import METHODS
+from .tasks import did_you_mean
+
+_INSTALLED = pathlib.Path(__file__).parent / "configs"
+CONFIG_DIR = _INSTALLED if _INSTALLED.is_dir() else pathlib.Path(__file__).parent.parent / "configs"
+
+
+@dataclasses.dataclass(frozen=True)
+class Hyper:
+    """Numbers that are traced: change or sweep them without compiling again.
+
+    Attributes:
+      actor_lr: Adam step size of the actors.
+      critic_lr: Adam step size of the reward critic and the cost critic.
+      max_grad_norm: gradients are scaled down to this global norm.
+      discount: per control step, for reward and cost alike.
+      trace_decay: lambda of generalised advantage estimation, for reward and cost alike.
+      clip: half-width of the interval the probability ratio is clipped to, and of the value clip.
+      entropy_coef: weight of the policy's entropy, in nats summed over action dimensions.
+      value_decay: how much of the running moments of returns survives an update.
+      cost_limit: allowed undiscounted cost of one agent per episode; nan takes the task's own limit.
+      lambda_init: multiplier before the first update.
+      lambda_lr: step of the multiplier per update, for a violation in cost per step.
+      lambda_max: upper bound of the multiplier.
+      surrogate_weight: weight of the mean of ratio * cost advantage in the multiplier's step.
+      cost_std_floor: cost advantages are divided by their deviation, but never by less than this.
+    """
+
+    actor_lr: float = 3e-4
+    critic_lr: float = 1e-3
+    max_grad_norm: float = 10.0
+    discount: float = 0.99
+    trace_decay: float = 0.95
+    clip: float = 0.2
+    entropy_coef: float = 0.0
+    value_decay: float = 0.995
+    cost_limit: float = math.nan
+    lambda_init: float = 0.78
+    lambda_lr: float = 0.1
+    lambda_max: float = 20.0
+    surrogate_weight: float = 1.0
+    cost_std_floor: float = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(Hyper):
+    """A run in full.
+
+    Attributes:
+      task: what to train on; `pmt envs` lists them.
+      method: who learns; a row of the table in pmt_jax/methods.py.
+      steps: environment steps to train for, per seed, over all its environments; rounded up to whole chunks.
+      seeds: how many seeds train side by side in one program.
+      seed: the first seed; the others count up from it.
+      num_envs: environments per seed, B.
+      rollout_length: control steps each environment takes between updates, T.
+      epochs: passes over the batch per update, for every network.
+      minibatches: parts the batch is cut into in each pass.
+      hidden: widths of the hidden layers of every network.
+      activation: of the hidden layers.
+      layer_norm: layer normalisation after each hidden layer.
+      obs_norm: running moments over the whole run, layer normalisation of the input, or nothing.
+      violation: how the episode cost is estimated for the multiplier: mean of the episodes that finished in this
+        update, or the cost rate of this update's steps times the horizon.
+      cost_advantage: standardised (with a floor) or only centred in the policy's loss.
+      physics: which engine simulates; auto takes the fastest for the device.
+      env: the task's own options, as name=value.
+      log_interval: updates per row of metrics.jsonl.
+    """
+
+    task: str = "lane"
+    method: str = "mappo_l"
+    steps: int = 1_000_000
+    seeds: int = 1
+    seed: int = 0
+    num_envs: int = 64
+    rollout_length: int = 64
+    epochs: int = 5
+    minibatches: int = 8
+    hidden: tuple[int, ...] = (128, 128)
+    activation: Literal["relu", "tanh", "elu"] = "relu"
+    layer_norm: bool = True
+    obs_norm: Literal["running", "layernorm", "none"] = "running"
+    violation: Literal["episode", "rate"] = "episode"
+    cost_advantage: Literal["std", "center"] = "std"
+    physics: Literal["auto", "mjx", "warp", "mujoco"] = "auto"
+    env: tuple[tuple[str, Any], ...] = ()
+    log_interval: int = 1
+
+    def __post_init__(self) -> None:
+        _validate(self)
+
+    @property
+    def batch_size(self) -> int:
+        """Environment steps of one update of one seed."""
+        return self.num_envs * self.rollout_length
+
+    @property
+    def num_chunks(self) -> int:
+        """Chunks of `log_interval` updates that cover `steps`."""
+        return math.ceil(self.steps / (self.batch_size * self.log_interval))
+
+    @property
+    def num_updates(self) -> int:
+        return self.num_chunks * self.log_interval
+
+    def replace(self, **changes: Any) -> Config:
+        """A copy with some fields changed, checked like a new one; values may be strings, as on a command line."""
+        return dataclasses.replace(self, **{k: convert(k, v) for k, v in changes.items()})
+
+
+FIELDS: dict[str, Any] = typing.get_type_hints(Config)
+HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
+
+
+def load_config(source: str | pathlib.Path, method: str | None = None, **overrides: Any) -> Config:
+    """Settings of a task: defaults, then the file, then its [method.NAME] table, then `overrides`.
+
+    Args:
+      source: a name in configs/, or the path of a TOML file (a run's own config.toml included).
+      method: a name in METHODS; the file's own choice if None.
+      **overrides: any field of Config.
+
+    Raises:
+      UsageError: no such file, an unknown field, or a value of the wrong type or range.
+
+    Example:
+      >>> load_config("lane", method="happo", num_envs=8).num_envs
+      8
+    """
+    table = _read(source)
+    tables = table.pop("method", {})
+    if isinstance(tables, str):  # a run's own config.toml names its one method
+        method, tables = method or tables, {}
+    method = method or str(Config.method)
+    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+        raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
+    for name in (*tables, method):
+        if name not in METHODS:
+            raise UsageError(f"unknown method '{name}'{did_you_mean(name, METHODS)}")
+    values = {**table, **tables.get(method, {}), **overrides, "method": method}
+    return Config(**{k: convert(k, v) for k, v in values.items()})
+
+
+def _read(source: str | pathlib.Path) -> dict[str, Any]:
+    known = sorted(p.stem for p in CONFIG_DIR.glob("*.toml"))
+    path = CONFIG_DIR / f"{source}.toml" if str(source) in known else pathlib.Path(source)
+    if not path.is_file():
+        if path.suffix == ".toml":
+            raise UsageError(f"there is no configuration file {path}")
+        raise UsageError(f"unknown task '{source}'{did_you_mean(str(source), known)} (pmt envs lists all)")
+    try:
+        return tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is not valid TOML: {error}") from None
+
+
+def convert(name: str, value: Any) -> Any:
+    """`value` (from TOML, a keyword or a command line) as the type that field `name` has.
+
+    Raises:
+      UsageError: unknown field, or a value that does not fit.
+    """
+    if name not in FIELDS:
+        raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
+    try:
+        return _convert(FIELDS[name], value)
+    except (ValueError, TypeError):
+        hint = expectation(FIELDS[name])
+        raise UsageError(f"{name} = {value!r} does not fit: expected {hint}") from None
+
+
+def _convert(kind: Any, value: Any) -> Any:
+    origin, parameters = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        if value in parameters:
+            return value
+    elif origin in (types.UnionType, typing.Union):
+        return None if value in (None, "none") else _convert(next(p for p in parameters if p is not type(None)), value)
+    elif kind is bool:
+        words = {"true": True, "false": False}
+        return value if isinstance(value, bool) else words[value] if value in words else _fail()
+    elif kind is int:
+        number = _fail() if isinstance(value, bool) else float(value)
+        return int(number) if number == int(number) else _fail()
+    elif kind is float:
+        return _fail() if isinstance(value, bool) else float(value)
+    elif kind is str:
+        return value if isinstance(value, str) else _fail()
+    elif parameters == (int, ...):
+        parts = value.split(",") if isinstance(value, str) else value
+        return tuple(_convert(int, part) for part in parts)
+    else:  # the task's own options
+        pairs = value.items() if isinstance(value, dict) else [p.split("=", 1) if isinstance(p, str) else p for p in value]
+        return tuple(sorted((str(k), _literal(v)) for k, v in pairs))
+    return _fail()
+
+
+def _literal(value: Any) -> Any:
+    """A task option as TOML would read it: numbers and booleans are recognised, the rest are strings."""
+    try:
+        return tomllib.loads(f"x = {value}")["x"] if isinstance(value, str) else value
+    except tomllib.TOMLDecodeError:
+        return value
+
+
+def _fail() -> typing.NoReturn:
+    raise ValueError
+
+
+def expectation(kind: Any) -> str:
+    """What a field of type `kind` takes, in words."""
+    if typing.get_origin(kind) is Literal:
+        return " | ".join(typing.get_args(kind))
+    if kind in (int, float, bool, str):
+        return {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
+    if typing.get_args(kind) == (int, ...):
+        return "whole numbers, as 128,128"
+    return "name=value"
+
+
+def descriptions() -> dict[str, str]:
+    """What each field means, read from the docstrings of Hyper and Config."""
+    entry = re.compile(r"^      (\w+): (.*(?:\n        .*)*)", re.MULTILINE)
+    return {
+        name: re.sub(r"\s+", " ", text).strip()
+        for cls in (Hyper, Config)
+        for name, text in entry.findall((cls.__doc__ or "").split("Attributes:")[1])
+    }
+
+
+def to_toml(config: Config) -> str:
+    """The run's settings as a file that `load_config` reads back to an equal Config."""
+    fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    options = fields.pop("env")
+    lines = [f"{name} = {_toml(value)}" for name, value in fields.items() if value is not None]
+    return "\n".join([*lines, *(["", "[env]"] if options else []), *(f"{k} = {_toml(v)}" for k, v in options), ""])
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return f"[{', '.join(map(str, value))}]" if isinstance(value, tuple | list) else repr(value)
+
+
+def _validate(config: Config) -> None:
+    counts = ("steps", "seeds", "num_envs", "rollout_length", "epochs", "minibatches", "log_interval")
+    for name in counts:
+        if getattr(config, name) < 1:
+            raise UsageError(f"{name} must be at least 1, not {getattr(config, name)}")
+    if config.seed < 0 or config.seed + config.seeds > 2**31:
+        raise UsageError(f"seed must lie between 0 and 2**31 - seeds, not {config.seed}")
+    if not config.hidden or min(config.hidden) < 1:
+        raise UsageError(f"hidden must name at least one layer of at least one unit, not {list(config.hidden)}")
+    if config.steps < config.batch_size:
+        raise UsageError(
+            f"steps = {config.steps} is less than one batch of num_envs * rollout_length = {config.num_envs} * "
+            f"{config.rollout_length} = {config.batch_size} steps; ask for more steps or a smaller batch"
+        )
+    if config.batch_size % config.minibatches:
+        raise UsageError(
+            f"a batch of {config.batch_size} steps cannot be cut into {config.minibatches} equal minibatches"
+        )
+    for name in ("discount", "trace_decay", "value_decay"):
+        if not 0 <= getattr(config, name) <= 1:
+            raise UsageError(f"{name} must lie in [0, 1], not {getattr(config, name)}")
+    positive = ("actor_lr", "critic_lr", "lambda_init", "lambda_lr", "entropy_coef", "lambda_max", "clip", "max_grad_norm")
+    for name in positive:
+        if not 0 <= getattr(config, name) < math.inf:
+            raise UsageError(f"{name} must be a number that is not negative, not {getattr(config, name)}")
+    if config.cost_limit < 0 or math.isinf(config.cost_limit):
+        raise UsageError(f"cost_limit must be a cost per episode of at least 0, not {config.cost_limit}")
+

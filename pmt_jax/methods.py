@@ -1,0 +1,35 @@
+"""The table of methods: what makes each of them is data, not code.
+
+All methods are one learner (`pmt_jax.learner`) with four switches; nothing outside this table asks for a method by name.
+Adding one is adding a row:
+
+  >>> METHODS["my_happo"] = Method(order="sequential", constraint="none")
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A point in the space of methods (specification, section 7).
+
+    Attributes:
+      order: `simultaneous` updates all agents at once; `sequential` updates them one after the other in random order,
+        each corrected by the factor M of those before it (HAPPO).
+      constraint: how the cost limit acts: `none`, or a `lagrangian` multiplier per agent and cost.
+      share_actor: one actor for all agents (needs equal action spaces and agent ids in the observation).
+    """
+
+    order: Literal["simultaneous", "sequential"]
+    constraint: Literal["none", "lagrangian"]
+    share_actor: bool = False
+
+
+METHODS: dict[str, Method] = {
+    "mappo": Method(order="simultaneous", constraint="none", share_actor=True),
+    "happo": Method(order="sequential", constraint="none"),
+    "mappo_l": Method(order="sequential", constraint="lagrangian"),
+}

@@ -1,0 +1,124 @@
+"""The networks; the only file that knows flax."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from . import distributions
+from .config import Config
+from .tasks import EnvSpec
+from .types import Params
+
+_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "tanh": nn.tanh, "elu": nn.elu}
+_GAINS = {"relu": math.sqrt(2), "tanh": 5 / 3, "elu": 1.0}
+
+
+class MLP(nn.Module):
+    """[LayerNorm of the input], then Dense, activation, [LayerNorm] for each hidden layer, then a linear head."""
+
+    hidden: tuple[int, ...]
+    outputs: int
+    head_gain: float
+    activation: str = "relu"
+    layer_norm: bool = True
+    input_norm: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        x = nn.LayerNorm()(x) if self.input_norm else x
+        for width in self.hidden:
+            x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(_GAINS[self.activation]))(x)
+            x = _ACTIVATIONS[self.activation](x)
+            x = nn.LayerNorm()(x) if self.layer_norm else x
+        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_gain))(x)
+
+
+class Actor(nn.Module):
+    """Mean of the Gaussian as a function of the observation; its deviation is a parameter of its own."""
+
+    trunk: MLP
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        std = distributions.std(self.param("std", nn.initializers.ones, (self.trunk.outputs,)))
+        return self.trunk(obs), std
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """The functions of a run's networks; weights live elsewhere.
+
+    Attributes:
+      num_actors: N, or 1 where all agents share one.
+      num_agents: N.
+    """
+
+    num_actors: int
+    num_agents: int
+    num_costs: int
+    obs_dim: int
+    state_dim: int
+    actor: Actor
+    critic: MLP
+    cost_critic: MLP
+
+    def init_actor(self, key: jax.Array) -> Params:
+        """Weights with a leading [num_actors]."""
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_actors))
+        return jax.vmap(lambda k: self.actor.init(k, jnp.zeros(self.obs_dim)))(keys)
+
+    def init_critic(self, key: jax.Array) -> Params:
+        return self.critic.init(key, jnp.zeros(self.state_dim))
+
+    def init_cost_critic(self, key: jax.Array) -> Params:
+        return self.cost_critic.init(key, jnp.zeros(self.state_dim))
+
+    def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
+        return self.actor.apply(params, obs)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
+
+    def policies(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """All agents' Gaussians: obs [..., N, O] -> mean [..., N, A] and std [N, A]."""
+        params = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])), params)
+        return jax.vmap(self.policy, in_axes=(0, -2), out_axes=(-2, 0))(params, obs)
+
+    def value(self, params: Params, state: jax.Array) -> jax.Array:
+        """V in normalised units: state [..., S] -> [...]."""
+        return _apply(self.critic, params, state)[..., 0]
+
+    def cost_value(self, params: Params, state: jax.Array) -> jax.Array:
+        """Vc in normalised units: state [..., S] -> [..., N, K]."""
+        heads = _apply(self.cost_critic, params, state)
+        return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
+
+
+def _apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
+    out: Any = module.apply(params, x)
+    return out
+
+
+def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
+    """The networks of a run."""
+
+    def mlp(outputs: int, head_gain: float) -> MLP:
+        return MLP(
+            config.hidden, outputs, head_gain, config.activation, config.layer_norm, config.obs_norm == "layernorm"
+        )
+
+    return Networks(
+        num_actors=1 if share_actor else spec.num_agents,
+        num_agents=spec.num_agents,
+        num_costs=spec.num_costs,
+        obs_dim=spec.obs_dim,
+        state_dim=spec.state_dim,
+        actor=Actor(mlp(spec.action_dim, 0.01)),
+        critic=mlp(1, 1.0),
+        cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
+    )

@@ -1,0 +1,66 @@
+"""Running moments: of observations (everything seen so far) and of returns (with forgetting)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from .types import Moments
+
+MIN_WEIGHT = 1e-5
+MIN_RETURN_VARIANCE = 1e-2
+MIN_OBS_VARIANCE = 1e-8
+OBS_CLIP = 10.0
+
+
+def init(shape: tuple[int, ...]) -> Moments:
+    """Moments of nothing; they normalise as the identity until the first update (see `deviation`)."""
+    return Moments(jnp.zeros(shape), jnp.zeros(shape), jnp.zeros(()))
+
+
+def accumulate(moments: Moments, x: jax.Array) -> Moments:
+    """Adds all rows of `x` [..., *shape]; every row ever seen weighs the same."""
+    rows = x.reshape(-1, *moments.mean.shape)
+    weight = moments.weight + rows.shape[0]
+    share = rows.shape[0] / weight
+    mean = moments.mean + share * (rows.mean(0) - moments.mean)
+    # Second *central* moments: their parallel update does not cancel digits as E[x^2] - E[x]^2 would.
+    between = share * (1 - share) * (rows.mean(0) - moments.mean) ** 2
+    return Moments(mean, (1 - share) * moments.second + share * rows.var(0) + between, weight)
+
+
+def normalise_obs(moments: Moments, x: jax.Array) -> jax.Array:
+    """`x` [..., *shape] centred, scaled and clipped to +-10; unchanged while nothing has been seen."""
+    scale = jnp.sqrt(jnp.maximum(moments.second, MIN_OBS_VARIANCE))
+    return jnp.where(moments.weight > 0, jnp.clip((x - moments.mean) / scale, -OBS_CLIP, OBS_CLIP), x)
+
+
+def forget(moments: Moments, x: jax.Array, decay: jax.Array | float) -> Moments:
+    """Exponentially forgetting raw moments of `x` [..., *shape], as value normalisation uses them (specification, 2.2)."""
+    rows = x.reshape(-1, *moments.mean.shape)
+    return Moments(
+        decay * moments.mean + (1 - decay) * rows.mean(0),
+        decay * moments.second + (1 - decay) * (rows**2).mean(0),
+        decay * moments.weight + (1 - decay),
+    )
+
+
+def centre_and_scale(moments: Moments) -> tuple[jax.Array, jax.Array]:
+    """Debiased mean and standard deviation of forgetting moments; (0, 1) while nothing has been seen."""
+    weight = jnp.maximum(moments.weight, MIN_WEIGHT)
+    mean = moments.mean / weight
+    variance = jnp.maximum(moments.second / weight - mean**2, MIN_RETURN_VARIANCE)
+    seen = moments.weight > 0
+    return jnp.where(seen, mean, 0.0), jnp.where(seen, jnp.sqrt(variance), 1.0)
+
+
+def normalise(moments: Moments, x: jax.Array) -> jax.Array:
+    """Returns `x` [..., *shape] in the normalised units a critic predicts."""
+    mean, scale = centre_and_scale(moments)
+    return (x - mean) / scale
+
+
+def denormalise(moments: Moments, x: jax.Array) -> jax.Array:
+    """The inverse of `normalise`."""
+    mean, scale = centre_and_scale(moments)
+    return x * scale + mean

@@ -1,0 +1,64 @@
+"""The door to the environments: the only file of pmt_jax that imports `envs`, and only when asked."""
+
+from __future__ import annotations
+
+import importlib
+import types
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from .errors import UsageError
+
+if TYPE_CHECKING:
+    from envs.base import Env, EnvSpec, State
+    from envs.vector import Outcome, VectorEnv, VectorState
+
+__all__ = ["Env", "EnvSpec", "Outcome", "State", "VectorEnv", "VectorState", "did_you_mean", "make", "names"]
+
+
+def _envs() -> types.ModuleType:
+    import envs
+
+    if getattr(envs, "__pmt__", None) != "pmt-jax":
+        raise UsageError(
+            f"another package named 'envs' stands in front of ours: {getattr(envs, '__file__', None) or envs}; "
+            "remove it (pip uninstall envs), or run from another folder, then reinstall pmt-jax"
+        )
+    return envs
+
+
+_TYPES = {"Env": "base", "EnvSpec": "base", "State": "base"}
+_TYPES |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector"}
+
+
+def __getattr__(name: str) -> Any:
+    """The contract's types, imported (with JAX) when first asked for."""
+    if name not in _TYPES:
+        raise AttributeError(f"module 'pmt_jax.tasks' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"{_envs().__name__}.{_TYPES[name]}"), name)
+
+
+def names() -> list[str]:
+    """The tasks that `make` knows."""
+    return _envs().names()
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """The nearest of `choices` as '; did you mean ...?', or all of them where none is near."""
+    return _envs().errors.did_you_mean(word, choices)
+
+
+def make(name: str, physics: str = "auto", **options: Any) -> Env:
+    """Builds a task, with the engine asked for where it has one.
+
+    Raises:
+      UsageError: unknown task or option, or an engine that cannot run here.
+    """
+    envs = _envs()
+    try:
+        if physics != "auto":
+            options["physics"] = physics
+        return envs.make(name, **options)
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from error
+

@@ -1,0 +1,166 @@
+"""Every pytree of the learner, once, with shapes.
+
+T time steps, B environments, N agents, O observation, A action, S state, K costs. Axes always come in this order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import Any
+
+import jax
+
+from .config import HYPER_FIELDS, Hyper
+from .tasks import VectorState
+
+Params = Any  # a pytree of network weights; for actors every leaf has a leading [N] ([1] where one actor is shared)
+
+jax.tree_util.register_dataclass(Hyper, data_fields=HYPER_FIELDS, meta_fields=())
+
+
+def pytree(cls: type) -> type:
+    """A frozen dataclass whose fields are a pytree's children."""
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+class Tag(enum.IntEnum):
+    """Names of the consumers of randomness: each folds its own tag into the update's key, so adding one moves no other."""
+
+    UPDATE = 0
+    ENV = 1
+    ACTION = 2
+    ORDER = 3
+    ACTOR = 4
+    CRITIC = 5
+    COST_CRITIC = 6
+
+
+@pytree
+class Moments:
+    """Running first and second moments; `weight` is how much has been seen (a count, or the debiasing term)."""
+
+    mean: jax.Array
+    second: jax.Array
+    weight: jax.Array
+
+
+@pytree
+class Trained:
+    """A network in training: its weights and Adam's state."""
+
+    params: Params
+    opt_state: Any
+
+
+@pytree
+class Critic:
+    """A value function in training, with the moments of its returns (heads in their own, normalised units)."""
+
+    net: Trained
+    returns: Moments
+
+
+@pytree
+class RolloutState:
+    """What the collection of experience carries from one update to the next.
+
+    vector: B environments; reward_sum [B], cost_sum [B, N, K], length [B]: sums over the running episodes.
+    """
+
+    vector: VectorState
+    reward_sum: jax.Array
+    cost_sum: jax.Array
+    length: jax.Array
+
+
+@pytree
+class Batch:
+    """One update's experience; observations and states are normalised with the moments of its beginning.
+
+    Attributes:
+      obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
+        under the policy that acted.
+      state, next_state: [T, B, S]; the next state is the one before any reset.
+      reward: [T, B]; cost: [T, B, N, K].
+      terminated, truncated: [T, B] bool, never both.
+      info: {name: [T, B]}.
+      non_finite: [T, B] bool, quarantined steps.
+      episode_reward: [T, B], episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to and with this step;
+        complete where the episode is done.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    mean: jax.Array
+    state: jax.Array
+    next_state: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    info: dict[str, jax.Array]
+    non_finite: jax.Array
+    episode_reward: jax.Array
+    episode_cost: jax.Array
+    episode_length: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """[T, B] bool: the episode ended with this step, for whichever reason."""
+        return self.terminated | self.truncated
+
+
+@pytree
+class PolicyRows:
+    """What a policy is improved on; R = T * B rows, with a leading [N] before an agent is chosen.
+
+    Attributes:
+      obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
+      advantage: [R], hybrid: reward less weighted cost.
+      cost_advantage: [R, K], centred, in cost units.
+      log_weight: [R], bias on the probability ratio.
+      factor: [R], M: the probability ratios of the agents updated before.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    mask: jax.Array
+    log_prob: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    advantage: jax.Array
+    cost_advantage: jax.Array
+    log_weight: jax.Array
+    factor: jax.Array
+
+
+@pytree
+class LearnerState:
+    """All that training carries; saving it and loading it continues the run bit for bit.
+
+    Attributes:
+      actor: weights with a leading agent axis.
+      critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
+      multiplier: [N, K], lambda.
+      episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier answers to.
+      obs_moments [O], state_moments [S]: of raw observations and states.
+      rollout: environments and running sums.
+      key: the run's key; update u draws from fold_in(key, u).
+      update: [] int32, updates done.
+    """
+
+    actor: Trained
+    critic: Critic
+    cost_critic: Critic
+    multiplier: jax.Array
+    episode_cost: jax.Array
+    obs_moments: Moments
+    state_moments: Moments
+    rollout: RolloutState
+    key: jax.Array
+    update: jax.Array
+
+
+Metrics = dict[str, jax.Array]
