@@ -42,6 +42,7 @@ from .errors import TaskError, one_of
 ENGINES = ("mjx", "mujoco", "warp")
 SOLVERS = ("converged", "fast")
 MUJOCO_SERIES = "3.17"  # RK4, contact margins and MJX's private hooks differ between minor versions
+_PIP = f"pip install 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
 
 
 def check_versions() -> None:
@@ -54,8 +55,7 @@ def check_versions() -> None:
     right = all(v is not None and v.startswith(MUJOCO_SERIES + ".") for v in found.values())
     if not right or len(set(found.values())) != 1:
         listing = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
-        pip = f"pip install 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
-        raise TaskError(f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {pip}")
+        raise TaskError(f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {_PIP}")
     if jax.__version__.startswith("0.10."):
         raise TaskError(f"jax {jax.__version__} deadlocks on CPUs; pip install 'jax>=0.9.2,!=0.10.*'")
 
@@ -167,6 +167,16 @@ def usable_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def _needs_post_constraint(readout: Readout) -> bool:
+    return any(field in ("cfrc_ext", "cfrc_int", "cacc") for field, _ in readout.values())
+
+
+def _start(model: mujoco.MjModel) -> PhysicsState:
+    dtype = jnp.result_type(float)
+    zeros = jnp.zeros(model.nv, dtype)
+    return PhysicsState(jnp.asarray(model.qpos0, dtype), zeros, zeros)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # MuJoCo's C engine
 
@@ -245,7 +255,7 @@ class _Worker:
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
         self._model, self._substeps = model, substeps
         self._data = data = mujoco.MjData(model)
-        self._post_constraint = any(field in ("cfrc_ext", "cfrc_int", "cacc") for field, _ in readout.values())
+        self._post_constraint = _needs_post_constraint(readout)
         for warning in data.warning:
             warning.number = 1  # C reports the first of each kind only, into MUJOCO_LOG.TXT of the working directory
         # [Only views: mjData owns the memory.]
@@ -289,40 +299,125 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_POOLS.clear)  # threads do not survive a fork; the child starts its own
 
 
-def _start(model: mujoco.MjModel) -> PhysicsState:
-    dtype = jnp.result_type(float)
-    zeros = jnp.zeros(model.nv, dtype)
-    return PhysicsState(jnp.asarray(model.qpos0, dtype), zeros, zeros)
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # MJX
 
 
-def _import_mjx() -> Any:
-    """`mujoco.mjx`, without what it prints when the optional warp is missing."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        return importlib.import_module("mujoco.mjx")
-
-
-_TRACING = threading.RLock()
-
-
 class XlaEngine:
-    """MJX."""
+    """MJX: pure XLA, any device, the same numbers run after run (on CPU and TPU)."""
 
     name = "mjx"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
-        mjx = _import_mjx()
+        mjx = import_mjx()
+        check_hooks()
         self._c_model = model
         self._substeps, self._readout = substeps, dict(readout)
-        with jax.ensure_compile_time_eval():
+        with jax.ensure_compile_time_eval():  # constants, also where an environment is made inside a traced function
             self._model = mjx.put_model(model, impl="jax")
-            self._data = mjx.make_data(self._model)
+            self._data = mjx.make_data(model, impl="jax")
 
     def start(self) -> PhysicsState:
         return _start(self._c_model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
-        raise NotImplementedError
+        mjx = import_mjx()
+        from mujoco.mjx._src import smooth
+
+        data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
+        # TF32 on NVIDIA would cost three digits.
+        with jax.default_matmul_precision("highest"), _hooked():
+            data = jax.lax.fori_loop(0, self._substeps, lambda _, d: mjx.step(self._model, d), data)
+            if _needs_post_constraint(self._readout):
+                data = smooth.rne_postconstraint(self._model, data)
+        out = {name: getattr(_holder(data, field), field)[index] for name, (field, index) in self._readout.items()}
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), out
+
+
+def import_mjx() -> Any:
+    """`mujoco.mjx`, imported on first use and without what it prints where the optional warp is missing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return importlib.import_module("mujoco.mjx")
+
+
+def _holder(data: Any, field: str) -> Any:
+    """MJX keeps some of mjData's fields in the part that belongs to the implementation."""
+    return data if field in {f.name for f in dataclasses.fields(data)} else data._impl
+
+
+def check_hooks() -> None:
+    """Whether the two private places of MJX that `_hooked` replaces are still there.
+
+    Raises:
+      TaskError: they are not; this MJX needs another look before it can be trusted to agree with C.
+    """
+    import_mjx()
+    from mujoco.mjx._src import collision_driver, solver
+    from mujoco.mjx._src.types import GeomType
+
+    table = getattr(collision_driver, "_COLLISION_FUNC", {})
+    found = (GeomType.PLANE, GeomType.CAPSULE) in table and callable(getattr(solver, "_while_loop_scan", None))
+    if not found:
+        raise TaskError(f"mujoco-mjx {_version('mujoco-mjx')} lacks the private hooks of {MUJOCO_SERIES}; {_PIP}")
+
+
+_HOOKING = threading.RLock()  # the hooks are module globals; two threads may trace at once
+
+
+@contextlib.contextmanager
+def _hooked() -> Iterator[None]:
+    """While MJX is being traced: C's contact frame for capsules on planes, and a line search that stops when done.
+
+    MJX's own line search is a scan over all iterations, for the sake of reverse-mode gradients, which nobody takes
+    through the physics here; a real loop is 1.6 times as fast at 50 iterations.
+    """
+    from mujoco.mjx._src import collision_driver, solver
+    from mujoco.mjx._src.types import GeomType
+
+    table, pair = collision_driver._COLLISION_FUNC, (GeomType.PLANE, GeomType.CAPSULE)
+    with _HOOKING:
+        stock = table[pair], solver._while_loop_scan
+        table[pair], solver._while_loop_scan = _plane_capsule, _while_loop
+        try:
+            yield
+        finally:
+            table[pair], solver._while_loop_scan = stock
+
+
+def _while_loop(cond: Any, body: Any, init: Any, max_iter: int) -> Any:
+    """`body` while `cond`, at most `max_iter` times; the counter is of the carry's first weak type, as MJX has it."""
+
+    def proceed(carry: Any) -> jax.Array:
+        count, value = carry
+        return (count < max_iter) & cond(value)
+
+    init = jax.tree.map(jnp.asarray, init)
+    return jax.lax.while_loop(proceed, lambda carry: (carry[0] + 1, body(carry[1])), (jnp.int32(0), init))[1]
+
+
+def _plane_capsule(model: Any, data: Any, _: Any, geoms: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Contacts [2 pairs] of planes and capsules: distance, position and frame, in the layout MJX's driver expects.
+
+    As in C, the first tangent is the capsule's axis projected on the plane, however steep the capsule; MJX's own
+    function lets go of it beyond 60 degrees, which changes friction, whose cone is a pyramid along the tangents.
+    """
+
+    def collide(plane: jax.Array, capsule: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        normal, axis = data.geom_xmat[plane][:, 2], data.geom_xmat[capsule][:, 2]
+        radius, half_length = model.geom_size[capsule][0], model.geom_size[capsule][1]
+        tangent = axis - normal * jnp.dot(normal, axis)
+        length = jnp.linalg.norm(tangent)
+        upright = length < 1e-6  # no direction to project: any tangent will do
+        other = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+        other = other - normal * jnp.dot(normal, other)
+        tangent = jnp.where(upright, other / jnp.linalg.norm(other), tangent / jnp.where(upright, 1.0, length))
+        frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
+        ends = data.geom_xpos[capsule] + jnp.array([[1.0], [-1.0]]) * half_length * axis
+        distance = (ends - data.geom_xpos[plane]) @ normal - radius
+        position = ends - normal * (radius + 0.5 * distance)[:, None]
+        return distance, position, jnp.stack([frame, frame])
+
+    return jax.tree.map(jnp.concatenate, jax.vmap(collide)(geoms[:, 0], geoms[:, 1]))
+
+
+_plane_capsule.ncon = 2  # contacts a pair, read by MJX's driver
