@@ -13,6 +13,7 @@ Example:
   ((2, 31), (2, 1))
 """
 
+# pyright: reportAttributeAccessIssue=false  (mujoco is a binary module without stubs)
 from __future__ import annotations
 
 import dataclasses
@@ -125,7 +126,7 @@ class AntCorridor:
         )
 
     def reset(self, key: jax.Array) -> State:
-        """The ant near its reference pose at the corridor's start; ankles begin outside their limits, as in the task."""
+        """The ant near its reference pose at the corridor's start; the ankles begin outside their limits."""
         position_key, velocity_key = jax.random.split(key)
         start = self._engine.start()
         qpos = start.qpos + jax.random.uniform(

@@ -2,7 +2,7 @@
 
 | engine   | where         | what it is                                                                        |
 |----------|---------------|-----------------------------------------------------------------------------------|
-| `mujoco` | CPU           | MuJoCo's C engine on a thread pool, one `jax.pure_callback` per control step      |
+| `mujoco` | CPU           | MuJoCo's C engine on a thread pool, called by XLA once per control step        |
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes                      |
 | `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                                           |
 
@@ -11,18 +11,21 @@ Signatures are those of one environment; batches come from `jax.vmap`, nested as
 Example:
   >>> import mujoco
   >>> from envs import physics
-  >>> model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>')
+  >>> ball = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+  >>> model = mujoco.MjModel.from_xml_string(ball)
   >>> engine = physics.make_engine(model, substeps=5, readout={"position": ("xpos", 1)}, physics="mujoco")
   >>> state, out = engine.step(engine.start(), jax.numpy.zeros(0))
   >>> out["position"].shape
   (3,)
 """
 
+# pyright: reportAttributeAccessIssue=false  (mujoco is a binary module without stubs)
 from __future__ import annotations
 
 import contextlib
 import copy
 import dataclasses
+import hashlib
 import importlib
 import importlib.metadata
 import importlib.util
@@ -37,6 +40,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import host_call
 from .errors import TaskError, one_of
 
 ENGINES = ("mjx", "mujoco", "warp")
@@ -55,7 +59,9 @@ def check_versions() -> None:
     right = all(v is not None and v.startswith(MUJOCO_SERIES + ".") for v in found.values())
     if not right or len(set(found.values())) != 1:
         listing = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
-        raise TaskError(f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {_PIP}")
+        raise TaskError(
+            f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {_PIP}"
+        )
     if jax.__version__.startswith("0.10."):
         raise TaskError(f"jax {jax.__version__} deadlocks on CPUs; pip install 'jax>=0.9.2,!=0.10.*'")
 
@@ -144,7 +150,7 @@ def make_engine(
         _cut_solver(model, fast_contacts)
     if physics == "mujoco":
         return CEngine(model, substeps, readout, threads)
-    return XlaEngine(model, substeps, readout)
+    return {"mjx": MjxEngine, "warp": WarpEngine}[physics](model, substeps, readout)
 
 
 def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
@@ -155,11 +161,39 @@ def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
 
 
 def resolve(physics: str) -> str:
-    """The engine that `physics` means on this machine."""
+    """The engine that `physics` means on this machine.
+
+    Raises:
+      TaskError: no such engine, or it cannot run here.
+    """
     one_of("physics", physics, ("auto", *ENGINES))
-    if physics != "auto":
-        return physics
-    return "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    if physics == "auto":
+        return next(name for name in _PREFERENCE if obstacle(name) is None)
+    reason = obstacle(physics)
+    if reason is not None:
+        raise TaskError(f"physics '{physics}' {reason}")
+    return physics
+
+
+_PREFERENCE = ("mujoco", "warp", "mjx")  # the first that can run: the first two never can on the same device
+
+
+def obstacle(physics: str) -> str | None:
+    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None where it can."""
+    device = jax.devices()[0]
+    if physics == "mujoco" and device.platform != "cpu":
+        return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
+    if physics == "warp":
+        if device.platform != "gpu" or "nvidia" not in device.device_kind.lower():
+            return f"needs an NVIDIA GPU; found {device.device_kind} (take 'mujoco' on CPUs, 'mjx' elsewhere)"
+        if _version("warp-lang") is None:
+            return "needs warp-lang; found none; install it with pip install 'pmt-jax[warp]'"
+    return None
+
+
+def explain() -> dict[str, str | None]:
+    """For each engine the obstacle to running it here, None where there is none."""
+    return {name: obstacle(name) for name in ENGINES}
 
 
 def usable_cpus() -> int:
@@ -182,62 +216,58 @@ def _start(model: mujoco.MjModel) -> PhysicsState:
 
 
 class CEngine:
-    """MuJoCo's C engine on a thread pool."""
+    """MuJoCo's C engine on a thread pool, called from inside the jitted program once per control step.
+
+    The numbers depend on neither the number of threads nor which of them advances which environment.
+    """
 
     name = "mujoco"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None):
+        if threads is not None and threads < 1:
+            raise TaskError(f"threads must be at least 1, not {threads}")
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._model = model
-        self._substeps = substeps
-        self._readout = dict(readout)
+        self._model, self._substeps, self._readout = model, substeps, dict(readout)
         self._threads = threads or usable_cpus()
-        self._idle: list[_Worker] = []
-        self._out_shapes = self._probe()
+        first = _Worker(model, substeps, readout)
+        self._idle = [first]  # as many as ever worked at once
+        self._parts, self._width = first.parts, first.width
+        self._key = self._fingerprint()
+        host_call.register(self._key, self._advance)
 
     def start(self) -> PhysicsState:
         return _start(self._model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
-        dtype = state.qpos.dtype
-        packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(dtype)])
-        width = sum(int(np.prod(shape)) for shape in self._out_shapes.values())
-        result = jax.ShapeDtypeStruct((width,), dtype)
-        flat = jax.pure_callback(self._advance, result, packed, vmap_method="broadcast_all")
-        parts, at = {}, 0
-        for name, shape in self._out_shapes.items():
-            size = int(np.prod(shape))
-            parts[name] = flat[at : at + size].reshape(shape)
-            at += size
-        state = PhysicsState(parts.pop("qpos"), parts.pop("qvel"), parts.pop("warmstart"))
-        return state, {name: parts[f"out:{name}"] for name in self._readout}
+        packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(state.qpos.dtype)])
+        flat = host_call.call(self._key, self._width, packed)
+        qpos, qvel, warmstart, *rest = (flat[place].reshape(shape) for place, shape in self._parts)
+        return PhysicsState(qpos, qvel, warmstart), dict(zip(self._readout, rest, strict=True))
 
-    def _probe(self) -> dict[str, tuple[int, ...]]:
-        worker = _Worker(self._model, self._substeps, self._readout)
-        self._idle.append(worker)
-        return worker.out_shapes
+    def _fingerprint(self) -> int:
+        """A number for what this engine computes, the same in every process: it stands in compiled programs."""
+        buffer = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
+        mujoco.mj_saveModel(self._model, None, buffer)
+        facts = f"{mujoco.__version__} {self._substeps} {sorted(self._readout.items(), key=str)} {self._threads}"
+        return int.from_bytes(hashlib.sha256(buffer.tobytes() + facts.encode()).digest()[:8], "little") >> 1
 
-    def _advance(self, packed: Any) -> np.ndarray:
-        """The host's side: packed [..., nq + 2 nv + nu] in, [..., outputs] out."""
-        packed = np.asarray(packed)
-        rows = packed.reshape(-1, packed.shape[-1])
-        width = sum(int(np.prod(shape)) for shape in self._out_shapes.values())
-        out = np.full((len(rows), width), np.nan, rows.dtype)
-        # Rows that are broken already stay broken; C would complain about them in MUJOCO_LOG.TXT.
-        sound = np.flatnonzero(np.isfinite(rows).all(axis=1)).tolist()
-        # The threads draw from one iterator (atomic in CPython), so a slow thread delays nobody.
-        queue = iter(sound)
+    def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
+        """The host's side: qpos, qvel, warm start and ctrl [..., D] to what `_Worker` writes [..., E]."""
+        rows, out = argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width)
+        sound = np.isfinite(rows).all(axis=1)
+        out[~sound] = np.nan  # broken before the step
+        # The threads draw rows from one iterator (atomic in CPython), so a slow thread delays nobody.
+        queue = iter(np.flatnonzero(sound).tolist())
         helpers = []
-        for _ in range(min(self._threads, len(sound)) - 1):
+        for _ in range(min(self._threads, int(sound.sum())) - 1):
             try:
                 helpers.append(_pool(self._threads).submit(self._work, queue, rows, out))
-            except RuntimeError:  # the interpreter is shutting down and takes no new work: do it all here
+            except RuntimeError:  # the interpreter is going down and takes no new work: this thread does it all
                 break
         self._work(queue, rows, out)
         for helper in helpers:
             helper.result()
-        return out.reshape(*packed.shape[:-1], width)
 
     def _work(self, queue: Iterator[int], rows: np.ndarray, out: np.ndarray) -> None:
         try:
@@ -246,6 +276,7 @@ class CEngine:
             worker = _Worker(self._model, self._substeps, self._readout)
         for row in queue:
             worker.advance(rows[row], out[row])
+        worker.check_memory()
         self._idle.append(worker)
 
 
@@ -256,30 +287,36 @@ class _Worker:
         self._model, self._substeps = model, substeps
         self._data = data = mujoco.MjData(model)
         self._post_constraint = _needs_post_constraint(readout)
+        self._warnings = data.warning
         for warning in data.warning:
-            warning.number = 1  # C reports the first of each kind only, into MUJOCO_LOG.TXT of the working directory
-        # [Only views: mjData owns the memory.]
-        self._inputs = _views([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl])
-        outputs = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart}
-        for name, (field, index) in readout.items():
-            outputs[f"out:{name}"] = getattr(data, field)[index]
-        self.out_shapes = {name: view.shape for name, view in outputs.items()}
-        self._outputs = _views([view.reshape(-1) for view in outputs.values()])
+            warning.number = 1  # C reports the first of each kind only, in a MUJOCO_LOG.TXT in the working directory
+        self._inputs = _places([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl])
+        outputs = [data.qpos, data.qvel, data.qacc_warmstart]
+        outputs += [getattr(data, field)[index] for field, index in readout.values()]
+        self._outputs = _places([view.reshape(-1) for view in outputs])
+        self.parts = [(place, view.shape) for view, (_, place) in zip(outputs, self._outputs, strict=True)]
+        self.width = self._outputs[-1][1].stop
 
     def advance(self, row: np.ndarray, out: np.ndarray) -> None:
-        """One control step of one environment: row [inputs] to out [outputs]."""
+        """One control step of one environment: `row` [D] to `out` [E]."""
         data = self._data
-        for view, part in self._inputs:
-            view[:] = row[part]
+        for view, place in self._inputs:
+            view[:] = row[place]
         data.time = 0.0
         mujoco.mj_step(self._model, data, self._substeps)
         if self._post_constraint:
             mujoco.mj_rnePostConstraint(self._model, data)
-        for view, part in self._outputs:
-            out[part] = view
+        for view, place in self._outputs:
+            out[place] = view
+
+    def check_memory(self) -> None:
+        """Contacts that found no room were dropped by C with a warning only."""
+        kinds = mujoco.mjtWarning
+        if any(self._warnings[int(kind)].number > 1 for kind in (kinds.mjWARN_CONTACTFULL, kinds.mjWARN_CNSTRFULL)):
+            raise MemoryError("MuJoCo ran out of room for contacts; raise <size memory=.../> in the model")
 
 
-def _views(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
+def _places(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
     """Each array with its place in their concatenation."""
     ends = np.cumsum([a.size for a in arrays]).tolist()
     return [(a, slice(end - a.size, end)) for a, end in zip(arrays, ends, strict=True)]
@@ -300,10 +337,10 @@ if hasattr(os, "register_at_fork"):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# MJX
+# MJX and MJX-Warp
 
 
-class XlaEngine:
+class MjxEngine:
     """MJX: pure XLA, any device, the same numbers run after run (on CPU and TPU)."""
 
     name = "mjx"
@@ -311,8 +348,7 @@ class XlaEngine:
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
         mjx = import_mjx()
         check_hooks()
-        self._c_model = model
-        self._substeps, self._readout = substeps, dict(readout)
+        self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         with jax.ensure_compile_time_eval():  # constants, also where an environment is made inside a traced function
             self._model = mjx.put_model(model, impl="jax")
             self._data = mjx.make_data(model, impl="jax")
@@ -324,14 +360,109 @@ class XlaEngine:
         mjx = import_mjx()
         from mujoco.mjx._src import smooth
 
-        data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
+        data = _loaded(self._data, state, ctrl)
         # TF32 on NVIDIA would cost three digits.
         with jax.default_matmul_precision("highest"), _hooked():
             data = jax.lax.fori_loop(0, self._substeps, lambda _, d: mjx.step(self._model, d), data)
             if _needs_post_constraint(self._readout):
                 data = smooth.rne_postconstraint(self._model, data)
-        out = {name: getattr(_holder(data, field), field)[index] for name, (field, index) in self._readout.items()}
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), out
+        return _unloaded(data, self._readout)
+
+
+class WarpEngine:
+    """MJX with the MuJoCo-Warp implementation. Its sums are atomic: runs do not repeat to the last bit."""
+
+    name = "warp"
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
+        mjx = import_mjx()
+        self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
+        self._contacts, self._rows = _room(model)
+        with jax.ensure_compile_time_eval():
+            self._model = mjx.put_model(model, impl="warp")
+            if _needs_post_constraint(readout):
+                self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": True})
+
+    def start(self) -> PhysicsState:
+        return _start(self._c_model)
+
+    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        lone = jax.tree.map(lambda x: x[None], (state, ctrl))
+        return jax.tree.map(lambda x: x[0], _flattened(self._step_all)(*lone))
+
+    def _step_all(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        """One control step of a batch: all arrays have a leading [B]."""
+        mjx = import_mjx()
+        data = self._make_data(len(ctrl))
+
+        def one(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+            own = _loaded(data, state, ctrl)
+            for _ in range(self._substeps):
+                own = mjx.step(self._model, own)
+            return _unloaded(own, self._readout)
+
+        return jax.vmap(one)(state, ctrl)
+
+    def _make_data(self, batch: int) -> Any:
+        """Warp keeps the contacts of all worlds in one buffer, so its size depends on the batch."""
+        mjx = import_mjx()
+        size = self._contacts * batch
+        with jax.ensure_compile_time_eval():
+            data = mjx.make_data(self._c_model, impl="warp", naconmax=size, njmax=self._rows)
+
+        def slim(leaf: Any) -> Any:  # the empty buffers are uniform: keep them out of the program's constants
+            large = getattr(leaf, "ndim", 0) > 0 and leaf.shape[0] == size and size > 1
+            return jnp.broadcast_to(leaf[:1], leaf.shape) if large else leaf
+
+        return jax.tree.map(slim, data)
+
+
+def _flattened(batched: Any) -> Any:
+    """A function of arrays with a leading [B] for which `vmap`, however nested, only makes B larger."""
+
+    @jax.custom_batching.custom_vmap
+    def call(*args: Any) -> Any:
+        return batched(*args)
+
+    @call.def_vmap
+    def rule(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
+        def spread(leaf: jax.Array, is_batched: bool) -> jax.Array:
+            leaf = leaf if is_batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+            return leaf.reshape(-1, *leaf.shape[2:])
+
+        out = _flattened(batched)(*jax.tree.map(spread, args, tuple(in_batched)))
+        out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return call
+
+
+_MOST_CONTACTS = 64  # of one world; 30 were enough for the ant, 60 for two hands
+
+
+def _room(model: mujoco.MjModel) -> tuple[int, int]:
+    """Contacts and constraint rows that one world of the model needs at most."""
+    first, second = np.triu_indices(model.ngeom, 1)
+    wanted = (model.geom_contype[first] & model.geom_conaffinity[second]) | (
+        model.geom_contype[second] & model.geom_conaffinity[first]
+    )
+    apart = model.body_weldid[model.geom_bodyid[first]] != model.body_weldid[model.geom_bodyid[second]]
+    each = np.full(mujoco.mjtGeom.mjNGEOMTYPES, 4)  # contact points of a pair, by the type with the most
+    each[mujoco.mjtGeom.mjGEOM_PLANE], each[mujoco.mjtGeom.mjGEOM_SPHERE], each[mujoco.mjtGeom.mjGEOM_CAPSULE] = 0, 1, 2
+    points = np.maximum(each[model.geom_type[first]], each[model.geom_type[second]])
+    contacts = max(1, min(int(points[(wanted != 0) & apart].sum()), _MOST_CONTACTS))
+    limits = int(model.jnt_limited.sum() + model.tendon_limited.sum())
+    dry = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
+    return contacts, 2 * (int(model.geom_condim.max()) - 1) * contacts + limits + dry + 6 * model.neq
+
+
+def _loaded(data: Any, state: PhysicsState, ctrl: jax.Array) -> Any:
+    return data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
+
+
+def _unloaded(data: Any, readout: Readout) -> tuple[PhysicsState, dict[str, jax.Array]]:
+    out = {name: getattr(_holder(data, field), field)[index] for name, (field, index) in readout.items()}
+    return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), out
 
 
 def import_mjx() -> Any:
@@ -420,4 +551,4 @@ def _plane_capsule(model: Any, data: Any, _: Any, geoms: jax.Array) -> tuple[jax
     return jax.tree.map(jnp.concatenate, jax.vmap(collide)(geoms[:, 0], geoms[:, 1]))
 
 
-_plane_capsule.ncon = 2  # contacts a pair, read by MJX's driver
+setattr(_plane_capsule, "ncon", 2)  # noqa: B010  (contacts a pair, read by MJX's driver)
