@@ -22,16 +22,18 @@ Example:
 # pyright: reportAttributeAccessIssue=false  (mujoco is a binary module without stubs)
 from __future__ import annotations
 
+import atexit
 import contextlib
 import copy
 import dataclasses
-import hashlib
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
 import io
 import os
 import threading
+import time
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -40,8 +42,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import host_call
 from .errors import TaskError, one_of
+from .host_call import host_call, register
 
 ENGINES = ("mjx", "mujoco", "warp")
 SOLVERS = ("converged", "fast")
@@ -226,6 +228,7 @@ class CEngine:
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None):
         if threads is not None and threads < 1:
             raise TaskError(f"threads must be at least 1, not {threads}")
+        _prepare_process()
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._model, self._substeps, self._readout = model, substeps, dict(readout)
@@ -233,28 +236,28 @@ class CEngine:
         first = _Worker(model, substeps, readout)
         self._idle = [first]  # as many as ever worked at once
         self._parts, self._width = first.parts, first.width
-        self._key = self._fingerprint()
-        host_call.register(self._key, self._advance)
+        self._target = register(self._advance)
 
     def start(self) -> PhysicsState:
         return _start(self._model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
         packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(state.qpos.dtype)])
-        flat = host_call.call(self._key, self._width, packed)
+        flat = host_call(self._target, packed, self._width)
         qpos, qvel, warmstart, *rest = (flat[place].reshape(shape) for place, shape in self._parts)
         return PhysicsState(qpos, qvel, warmstart), dict(zip(self._readout, rest, strict=True))
 
-    def _fingerprint(self) -> int:
-        """A number for what this engine computes, the same in every process: it stands in compiled programs."""
-        buffer = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
-        mujoco.mj_saveModel(self._model, None, buffer)
-        facts = f"{mujoco.__version__} {self._substeps} {sorted(self._readout.items(), key=str)} {self._threads}"
-        return int.from_bytes(hashlib.sha256(buffer.tobytes() + facts.encode()).digest()[:8], "little") >> 1
-
     def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
         """The host's side: qpos, qvel, warm start and ctrl [..., D] to what `_Worker` writes [..., E]."""
-        rows, out = argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width)
+        if _leaving.is_set():
+            raise RuntimeError("the interpreter is shutting down; the program that ran is given up")
+        _running.append(None)
+        try:
+            self._advance_rows(argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width))
+        finally:
+            _running.pop()
+
+    def _advance_rows(self, rows: np.ndarray, out: np.ndarray) -> None:
         sound = np.isfinite(rows).all(axis=1)
         out[~sound] = np.nan  # broken before the step
         # The threads draw rows from one iterator (atomic in CPython), so a slow thread delays nobody.
@@ -322,18 +325,36 @@ def _places(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
     return [(a, slice(end - a.size, end)) for a, end in zip(arrays, ends, strict=True)]
 
 
-_POOLS: dict[int, ThreadPoolExecutor] = {}
+_pools: dict[int, ThreadPoolExecutor] = {}
+_running: list[None] = []  # one entry for each host call under way
+_leaving = threading.Event()
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
     """One pool for all engines with that many threads; the calling thread works too, hence one fewer."""
-    if threads not in _POOLS:
-        _POOLS[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="pmt-physics")
-    return _POOLS[threads]
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="pmt-physics")
+    return _pools[threads]
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_POOLS.clear)  # threads do not survive a fork; the child starts its own
+@functools.cache
+def _prepare_process() -> None:
+    """What makes threads safe to fork and to leave; done once, when the first engine is built."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork; the child starts its own
+    atexit.register(_leave)
+
+
+def _leave() -> None:
+    """Ends programs that still run when the interpreter exits: XLA's threads would call into what no longer exists."""
+    _leaving.set()
+    with contextlib.suppress(Exception):  # the programs given up raise here, and nobody is left to tell
+        for array in jax.live_arrays():
+            with contextlib.suppress(Exception):
+                array.block_until_ready()
+    deadline = time.monotonic() + 10.0
+    while _running and time.monotonic() < deadline:
+        time.sleep(0.01)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
