@@ -45,12 +45,26 @@ def make(name: str, **options: Any) -> Env:
       >>> make("lane").spec.num_agents
       2
     """
-    if name not in _TASKS:
-        raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
-    module, class_name, fixed = _TASKS[name]
-    cls = getattr(importlib.import_module(f".{module}", __name__), class_name)
-    known = [p for p in inspect.signature(cls).parameters if p not in fixed]
+    known = task_options(name)
     for option in options:
         if option not in known:
             raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
+    cls, fixed = _task(name)
     return cls(**fixed, **options)
+
+
+def task_options(name: str) -> list[str]:
+    """The names of the options that a task takes.
+
+    Raises:
+      TaskError: unknown name.
+    """
+    cls, fixed = _task(name)
+    return [p for p in inspect.signature(cls).parameters if p not in fixed]
+
+
+def _task(name: str) -> tuple[type, dict[str, Any]]:
+    if name not in _TASKS:
+        raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
+    module, class_name, fixed = _TASKS[name]
+    return getattr(importlib.import_module(f".{module}", __name__), class_name), fixed

@@ -16,6 +16,7 @@ import itertools
 import sys
 import traceback
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -72,7 +73,7 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Error))
 
 _names = itertools.count()
-_alive: list[ctypes._CFuncPtr] = []  # XLA keeps the addresses for the life of the process
+_alive: list[Any] = []  # XLA keeps the addresses for the life of the process
 
 
 def register(function: HostFunction) -> str:
@@ -103,7 +104,7 @@ def register(function: HostFunction) -> str:
 
 
 def host_call(name: str, operand: jax.Array, width: int) -> jax.Array:
-    """The registered function `name` on `operand` [..., I]: [..., width] of the same dtype; batch axes come from vmap."""
+    """The registered function `name` on `operand` [..., I]: [..., width] of its dtype; batch axes come from vmap."""
     result = jax.ShapeDtypeStruct((*operand.shape[:-1], width), operand.dtype)
     return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(operand)
 
@@ -127,7 +128,7 @@ def _array(buffers: ctypes.Structure) -> np.ndarray:
     size = int(np.prod(shape)) * dtype.itemsize
     if size == 0:
         return np.empty(shape, dtype)
-    return np.frombuffer((ctypes.c_char * size).from_address(buffer.data), dtype).reshape(shape)
+    return np.frombuffer(memoryview((ctypes.c_char * size).from_address(buffer.data)), dtype).reshape(shape)
 
 
 def _error(api_address: int, message: str) -> int | None:

@@ -6,7 +6,7 @@ Two agents with two actions each share reward and cost; an episode has 25 steps 
 |---|---|---|---|---|
 | `lane` | y' = 0.8 y + 0.2 sum_i mean(a_i) | 1 - (y' - 1)^2 | y' > 0.5 | 18.64 / 18.85 / 24.561 (24) |
 | `switch` | none | 1 - (a_00 - 0.9)^2 - 0.1 sum_others (a - 0.5)^2 | abs(a_00) > 0.3 | 16 / 16.36 / 25 (25) |
-| `noisy` | as `lane` | as `lane` | y' > 0.5, with probability 0.3 | as `lane`, the cost of a step beyond is 0.3 in the mean |
+| `noisy` | as `lane` | as `lane` | y' > 0.5, with probability 0.3 | as `lane`; a step beyond costs 0.3 in the mean |
 
 `lane` has a cost of the state, like the ant; `switch` a cost of the action alone, like the hands; `noisy` a cost that
 must be appraised before it can be avoided.

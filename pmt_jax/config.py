@@ -209,7 +209,8 @@ def _convert(kind: Any, value: Any) -> Any:
         parts = value.split(",") if isinstance(value, str) else value
         return tuple(_convert(int, part) for part in parts)
     else:  # the task's own options
-        pairs = value.items() if isinstance(value, dict) else [p.split("=", 1) if isinstance(p, str) else p for p in value]
+        items = value.items() if isinstance(value, dict) else value
+        pairs = [item.split("=", 1) if isinstance(item, str) else item for item in items]
         return tuple(sorted((str(k), _literal(v)) for k, v in pairs))
     return _fail()
 
@@ -284,10 +285,9 @@ def _validate(config: Config) -> None:
     for name in ("discount", "trace_decay", "value_decay"):
         if not 0 <= getattr(config, name) <= 1:
             raise UsageError(f"{name} must lie in [0, 1], not {getattr(config, name)}")
-    positive = ("actor_lr", "critic_lr", "lambda_init", "lambda_lr", "entropy_coef", "lambda_max", "clip", "max_grad_norm")
-    for name in positive:
+    rates = ("actor_lr", "critic_lr", "lambda_init", "lambda_lr", "lambda_max")
+    for name in (*rates, "entropy_coef", "clip", "max_grad_norm", "surrogate_weight", "cost_std_floor"):
         if not 0 <= getattr(config, name) < math.inf:
             raise UsageError(f"{name} must be a number that is not negative, not {getattr(config, name)}")
     if config.cost_limit < 0 or math.isinf(config.cost_limit):
         raise UsageError(f"cost_limit must be a cost per episode of at least 0, not {config.cost_limit}")
-

@@ -36,7 +36,8 @@ class Run:
         values = {name: getattr(self.config, name) for name in HYPER_FIELDS}
         if math.isnan(values["cost_limit"]):
             values["cost_limit"] = self.vector.spec.cost_limit
-        return Hyper(**{name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
+        traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+        return Hyper(**traced)
 
 
 def setup(config: Config) -> Run:
@@ -124,7 +125,14 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
         run, hyper, state.critic, run.nets.value, batch.state, value, returns, tagged[Tag.CRITIC]
     )
     cost_critic, cost_critic_metrics = _fit_critic(
-        run, hyper, state.cost_critic, run.nets.cost_value, batch.state, cost_value, cost_returns, tagged[Tag.COST_CRITIC]
+        run,
+        hyper,
+        state.cost_critic,
+        run.nets.cost_value,
+        batch.state,
+        cost_value,
+        cost_returns,
+        tagged[Tag.COST_CRITIC],
     )
 
     # 5 Coping response: every agent's policy, and the price of danger.
@@ -195,7 +203,7 @@ def _fit_critic(
     returns: jax.Array,
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:
-    """Updates the moments of the returns once, then fits the critic to them in the new units (specification, 2.2, 2.3)."""
+    """Updates the moments of the returns once, then fits the critic to them in the new units (Eq. 12)."""
     moments = normalise.forget(critic.returns, returns, hyper.value_decay)
     rows = (state, normalise.normalise(moments, old_value), normalise.normalise(moments, returns))
 

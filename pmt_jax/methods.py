@@ -1,6 +1,6 @@
 """The table of methods: what makes each of them is data, not code.
 
-All methods are one learner (`pmt_jax.learner`) with four switches; nothing outside this table asks for a method by name.
+All methods are one learner (`pmt_jax.learner`) with a few switches; nothing else asks for a method by name.
 Adding one is adding a row:
 
   >>> METHODS["my_happo"] = Method(order="sequential", constraint="none")

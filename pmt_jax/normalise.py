@@ -36,7 +36,7 @@ def normalise_obs(moments: Moments, x: jax.Array) -> jax.Array:
 
 
 def forget(moments: Moments, x: jax.Array, decay: jax.Array | float) -> Moments:
-    """Exponentially forgetting raw moments of `x` [..., *shape], as value normalisation uses them (specification, 2.2)."""
+    """Exponentially forgetting raw moments of `x` [..., *shape], for returns (specification, section 2.2)."""
     rows = x.reshape(-1, *moments.mean.shape)
     return Moments(
         decay * moments.mean + (1 - decay) * rows.mean(0),
@@ -51,7 +51,7 @@ def centre_and_scale(moments: Moments) -> tuple[jax.Array, jax.Array]:
     mean = moments.mean / weight
     variance = jnp.maximum(moments.second / weight - mean**2, MIN_RETURN_VARIANCE)
     seen = moments.weight > 0
-    return jnp.where(seen, mean, 0.0), jnp.where(seen, jnp.sqrt(variance), 1.0)
+    return mean * seen, jnp.where(seen, jnp.sqrt(variance), jnp.ones_like(variance))
 
 
 def normalise(moments: Moments, x: jax.Array) -> jax.Array:

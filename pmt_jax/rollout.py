@@ -28,7 +28,12 @@ def start(vector: VectorEnv, key: jax.Array) -> RolloutState:
 
 
 def collect(
-    vector: VectorEnv, state: RolloutState, policy: Policy, normalise: tuple[Normalise, Normalise], key: jax.Array, steps: int
+    vector: VectorEnv,
+    state: RolloutState,
+    policy: Policy,
+    normalise: tuple[Normalise, Normalise],
+    key: jax.Array,
+    steps: int,
 ) -> tuple[RolloutState, Batch, tuple[jax.Array, jax.Array]]:
     """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
 
@@ -85,9 +90,7 @@ def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) ->
 
 def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
     going = ~(outcome.terminated | outcome.truncated)
-    return RolloutState(
-        sums.vector, sums.reward_sum * going, sums.cost_sum * going[:, None, None], sums.length * going
-    )
+    return RolloutState(sums.vector, sums.reward_sum * going, sums.cost_sum * going[:, None, None], sums.length * going)
 
 
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:

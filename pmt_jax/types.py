@@ -25,7 +25,7 @@ def pytree(cls: type) -> type:
 
 
 class Tag(enum.IntEnum):
-    """Names of the consumers of randomness: each folds its own tag into the update's key, so adding one moves no other."""
+    """The consumers of randomness: each folds its tag into the update's key, so adding one moves no other."""
 
     UPDATE = 0
     ENV = 1

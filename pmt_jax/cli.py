@@ -1,0 +1,148 @@
+"""`pmt train | eval | envs`: words into settings, nothing else."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from . import config as settings
+from . import tasks
+from .errors import UsageError
+from .methods import METHODS
+
+_POSITIONAL = ("task",)
+_METAVARS = {int: "N", float: "X"}
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse that raises one sentence, with the nearest known word, instead of printing its usage and exiting."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see {self.prog} --help)")
+
+    def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
+        known, unknown = self.parse_known_args(argv)
+        if unknown:
+            flags = [f for a in _actions(self, known) for f in a.option_strings]
+            raise UsageError(f"unknown argument '{unknown[0]}'{tasks.did_you_mean(unknown[0].split('=')[0], flags)}")
+        return known
+
+
+def _actions(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> list[argparse.Action]:
+    chosen = getattr(parsed, "command", None)
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction) and chosen in action.choices:
+            return action.choices[chosen]._actions
+    return parser._actions
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns its exit code (2 for a user's mistake)."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    try:
+        parser, commands = _parser()
+        if argv and not argv[0].startswith("-") and argv[0] not in commands:
+            raise UsageError(f"unknown command '{argv[0]}'{tasks.did_you_mean(argv[0], commands)}")
+        arguments = parser.parse_all(argv)
+        if arguments.command is None:
+            parser.print_help()
+            return 0
+        return arguments.run(arguments)
+    except UsageError as error:
+        print(f"pmt: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _parser() -> tuple[_Parser, list[str]]:
+    parser = _Parser(prog="pmt", description=__import__("pmt_jax").__doc__, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"pmt {__import__('pmt_jax').__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    _add_train(commands)
+    _add_eval(commands)
+    envs = commands.add_parser("envs", help="list the tasks", allow_abbrev=False)
+    envs.set_defaults(run=_envs)
+    return parser, list(commands.choices)
+
+
+def _add_train(commands: Any) -> None:
+    train = commands.add_parser(
+        "train",
+        help="train a team: pmt train ant_2x4",
+        description="Trains on TASK, or as a TOML file says.",
+        allow_abbrev=False,
+    )
+    train.add_argument("source", metavar="TASK|CONFIG", help="a task's name (pmt envs lists them) or a TOML file")
+    train.add_argument("--out", type=pathlib.Path, help="the run folder (default: runs/TASK-METHOD-TIME)")
+    train.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
+    train.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    group = train.add_argument_group("settings", "each may also stand in the TOML file")
+    defaults = settings.Config()
+    for name, text in settings.descriptions().items():
+        if name in _POSITIONAL:
+            continue
+        kind = settings.FIELDS[name]
+        words = " | ".join(METHODS) if name == "method" else settings.expectation(kind)
+        default = getattr(defaults, name)
+        hint = f"{text.replace('%', '%%')} [{words}; default {default}]" if name != "env" else f"{text} [{words}]"
+        flag = f"--{name.replace('_', '-')}"
+        action = "append" if name == "env" else "store"
+        group.add_argument(flag, dest=f"set_{name}", metavar=_METAVARS.get(kind, "WORD"), action=action, help=hint)
+    train.set_defaults(run=_train)
+
+
+def _add_eval(commands: Any) -> None:
+    evaluation = commands.add_parser(
+        "eval",
+        help="evaluate a trained run: pmt eval runs/x",
+        description="Reward, cost and violation rate of a run's final policies over whole episodes with fixed keys.",
+        allow_abbrev=False,
+    )
+    evaluation.add_argument("folder", metavar="RUN", type=pathlib.Path, help="a run folder")
+    evaluation.add_argument("--episodes", default="32", help="episodes per seed (default 32)")
+    evaluation.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
+    evaluation.set_defaults(run=_eval)
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    given = {k.removeprefix("set_"): v for k, v in vars(arguments).items() if k.startswith("set_") and v is not None}
+    config = settings.load_config(arguments.source, **given)
+    if arguments.resume and arguments.out is None:
+        raise UsageError("--resume needs --out, the folder of the run to continue")
+    from . import experiment
+
+    return experiment.train(config, arguments.out, arguments.resume, cache=not arguments.no_cache, say=_say)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _eval(arguments: argparse.Namespace) -> int:
+    if not arguments.episodes.isdecimal() or int(arguments.episodes) < 1:
+        raise UsageError(f"--episodes must be a whole number of at least 1, not '{arguments.episodes}'")
+    from . import experiment
+
+    rows = experiment.evaluate_run(arguments.folder, int(arguments.episodes), arguments.deterministic)
+    how = "mean actions" if arguments.deterministic else "sampled actions"
+    print(f"{arguments.folder}: {arguments.episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
+    for row in rows:
+        print(f"seed {row['seed']} (cost limit {row['cost_limit']:g} an episode)")
+        for name, figures in row.items():
+            if isinstance(figures, tuple):
+                print(f"  {name:24} {figures[0]:12.4f} +- {figures[1]:.4f}")
+    return 0
+
+
+def _envs(arguments: argparse.Namespace) -> int:
+    del arguments
+    print("\n".join(tasks.names()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
