@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import pathlib
 import sys
 from collections.abc import Sequence
@@ -113,6 +114,7 @@ def _train(arguments: argparse.Namespace) -> int:
     config = settings.load_config(arguments.source, **given)
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
+    _quiet_xla()
     from . import experiment
 
     return experiment.train(config, arguments.out, arguments.resume, cache=not arguments.no_cache, say=_say)
@@ -122,9 +124,16 @@ def _say(line: str) -> None:
     print(line, flush=True)
 
 
+def _quiet_xla() -> None:
+    """Silences XLA's C++ log before it loads: every program taken from the compile cache would print a page of CPU
+    features that it wrongly takes for missing."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
 def _eval(arguments: argparse.Namespace) -> int:
     if not arguments.episodes.isdecimal() or int(arguments.episodes) < 1:
         raise UsageError(f"--episodes must be a whole number of at least 1, not '{arguments.episodes}'")
+    _quiet_xla()
     from . import experiment
 
     rows = experiment.evaluate_run(arguments.folder, int(arguments.episodes), arguments.deterministic)

@@ -123,7 +123,7 @@ def _write_once(out: pathlib.Path, config: Config) -> None:
 
 
 def _forget_rows_after(metrics: pathlib.Path, step: int) -> None:
-    """Drops what was logged after the checkpoint that the run continues from, or was cut off in the middle of a line."""
+    """Drops what was logged after the checkpoint that the run continues from, and what was cut off in mid-line."""
     if not metrics.exists():
         return
     kept = []

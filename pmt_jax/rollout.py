@@ -96,7 +96,7 @@ def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
     """Mean of `x` [T, B, ...] over the steps that ended an episode; nan where none did."""
     done = batch.done.reshape(batch.done.shape + (1,) * (x.ndim - 2))
-    return jnp.sum(x * done, (0, 1)) / jnp.where(done.any(), done.sum(), jnp.nan)
+    return jnp.sum(x * done, (0, 1)) / done.sum()  # 0 / 0 is nan
 
 
 def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:
