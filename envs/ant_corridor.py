@@ -13,7 +13,8 @@ Example:
   ((2, 31), (2, 1))
 """
 
-# pyright: reportAttributeAccessIssue=false  (mujoco is a binary module without stubs)
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import dataclasses

@@ -19,7 +19,8 @@ Example:
   (3,)
 """
 
-# pyright: reportAttributeAccessIssue=false  (mujoco is a binary module without stubs)
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import atexit
@@ -34,6 +35,7 @@ import io
 import os
 import threading
 import time
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -277,9 +279,13 @@ class CEngine:
             worker = self._idle.pop()
         except IndexError:
             worker = _Worker(self._model, self._substeps, self._readout)
-        for row in queue:
-            worker.advance(rows[row], out[row])
-        worker.check_memory()
+        _thread.quiet = True
+        try:
+            for row in queue:
+                worker.advance(rows[row], out[row])
+            worker.check_memory()
+        finally:
+            _thread.quiet = False
         self._idle.append(worker)
 
 
@@ -292,7 +298,7 @@ class _Worker:
         self._post_constraint = _needs_post_constraint(readout)
         self._warnings = data.warning
         for warning in data.warning:
-            warning.number = 1  # C reports the first of each kind only, in a MUJOCO_LOG.TXT in the working directory
+            warning.number = 1  # C reports the first of each kind only
         self._inputs = _places([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl])
         outputs = [data.qpos, data.qvel, data.qacc_warmstart]
         outputs += [getattr(data, field)[index] for field, index in readout.values()]
@@ -328,6 +334,7 @@ def _places(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
 _pools: dict[int, ThreadPoolExecutor] = {}
 _running: list[None] = []  # one entry for each host call under way
 _leaving = threading.Event()
+_thread = threading.local()  # its `quiet` is True while the thread works for us
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
@@ -339,10 +346,21 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 @functools.cache
 def _prepare_process() -> None:
-    """What makes threads safe to fork and to leave; done once, when the first engine is built."""
+    """What makes threads safe to fork and to leave, and C quiet; done once, when the first engine is built."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork; the child starts its own
     atexit.register(_leave)
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_hear)
+
+
+def _hear(message: str) -> None:
+    """MuJoCo's warnings, which it would write to a MUJOCO_LOG.TXT in the working directory.
+
+    Those of our own simulations say that one is about to break, which its numbers tell the quarantine anyway.
+    """
+    if not getattr(_thread, "quiet", False):
+        warnings.warn(f"MuJoCo: {message}", stacklevel=2)
 
 
 def _leave() -> None:

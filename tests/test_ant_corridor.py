@@ -1,0 +1,297 @@
+"""The corridor ant against transitions recorded from the reference environment, and against its own rules."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import envs
+from envs import ant_corridor
+from envs.errors import TaskError
+
+DATA = Path(__file__).parent / "data"
+TOLERANCE = {"qpos": 5e-5, "qvel": 5e-3, "reward_contact": 1e-5, "reward": 2e-3, "torso_xpos": 5e-5}
+# Here the ant stands inside a wall, which turns it at 1e-3 rad/s for the control step. Ours are drawn only.
+WALL_OBS_TOLERANCE = 2e-3
+# MJX solves in float32: two of 579 rollout rows come out at 1.3e-4.
+OBS_TOLERANCE = {"mujoco": 1e-4, "mjx": 2e-4}
+
+
+@functools.cache
+def recording(name: str) -> dict[str, np.ndarray]:
+    with np.load(DATA / f"ant_reference_{name[4:]}.npz") as data:
+        return dict(data)
+
+
+@functools.cache
+def stepper(physics: str):
+    """One compiled program for both partitions: they differ in nothing but names and one-hot indices."""
+    env = envs.make("ant_2x4", physics=physics)
+    return env, jax.jit(jax.vmap(env.step))
+
+
+def restored(env, rows):
+    return jax.vmap(env.restore)(rows["qpos0"], rows["qvel0"], rows["warm0"], rows["torso_xpos0"])
+
+
+def inside_wall(rows) -> np.ndarray:
+    """Rows whose torso overlaps a wall, six boxes 20 m to either side of their centre."""
+    x, y = rows["qpos0"][:, 0], rows["qpos0"][:, 1]
+    along = np.abs(x[:, None] - np.array([0.0, 40.0, 80.0])).min(axis=1) < 17.4
+    distance = np.abs(np.abs(np.asarray(ant_corridor.off_centre(x, y))) - 5.0) * np.cos(np.pi / 6)
+    return along & (distance < 0.9)
+
+
+def worst(actual, expected) -> float:
+    return float(np.abs(np.asarray(actual, np.float64) - expected).max())
+
+
+@pytest.fixture(scope="session", params=["mujoco", "mjx"])
+def replay(request):
+    """Recording and our State after one control step from each of its rows."""
+    rows = recording("ant_2x4")
+    env, step = stepper(request.param)
+    actions = rows["action"].reshape(-1, 2, 4).astype(np.float32)
+    return request.param, rows, jax.block_until_ready(step(restored(env, rows), actions))
+
+
+def check_replay(rows, after) -> None:
+    physics = after.carry.physics
+    assert worst(physics.qpos, rows["qpos1"]) < TOLERANCE["qpos"]
+    assert worst(physics.qvel, rows["qvel1"]) < TOLERANCE["qvel"]
+    assert worst(after.carry.torso_xpos, rows["torso_xpos1"]) < TOLERANCE["torso_xpos"]
+    assert worst(after.reward, rows["reward"]) < TOLERANCE["reward"]
+    for part in ("reward_forward", "reward_ctrl", "reward_contact"):
+        assert worst(after.info[part], rows[part]) < TOLERANCE.get(part, TOLERANCE["reward"])
+    for flag in ("cost_obj", "cost_done"):
+        np.testing.assert_array_equal(after.info[flag], rows[flag])
+    np.testing.assert_array_equal(after.cost[:, :, 0], np.broadcast_to(rows["cost"][:, None], after.cost.shape[:2]))
+    np.testing.assert_array_equal(after.terminated, rows["done"])
+
+
+def check_obs(rows, obs, tolerance) -> None:
+    kept = np.array([not case.startswith("branch x=60") for case in rows["case"]])
+    wall = inside_wall(rows)
+    error = np.abs(np.asarray(obs, np.float64) - rows["obs1"]).max(axis=(1, 2))
+    assert error[kept & ~wall].max() < tolerance
+    assert error[kept & wall].max() < WALL_OBS_TOLERANCE
+
+
+def test_reproduces_the_recorded_physics_reward_cost_and_termination(replay):
+    _, rows, after = replay
+    check_replay(rows, after)
+
+
+def test_reproduces_the_recorded_observations(replay):
+    name, rows, after = replay
+    check_obs(rows, after.obs, OBS_TOLERANCE[name])
+
+
+def test_reproduces_the_recorded_4x2_on_the_c_engine():
+    rows, env = recording("ant_4x2"), envs.make("ant_4x2", physics="mujoco")
+    after = jax.jit(jax.vmap(env.step))(restored(env, rows), rows["action"].reshape(-1, 4, 2).astype(np.float32))
+    check_replay(rows, after)
+    check_obs(rows, after.obs, OBS_TOLERANCE["mujoco"])
+
+
+def test_4x2_observations_on_mjx_from_its_2x4_states(replay):
+    """Both partitions recorded the same physics, so 4x2's observations follow from 2x4's states."""
+    name, _, after = replay
+    rows, env = recording("ant_4x2"), envs.make("ant_4x2", physics="mujoco")
+    np.testing.assert_array_equal(rows["qpos1"], recording("ant_2x4")["qpos1"])
+    physics = after.carry.physics
+    obs = jax.vmap(env.restore)(physics.qpos, physics.qvel).obs
+    check_obs(rows, obs, OBS_TOLERANCE[name])
+
+
+def test_walls_explain_the_rows_that_miss_the_tolerance():
+    """With the six milligram boxes as free bodies, as in the original, those rows agree too."""
+    rows = {k: v[inside_wall(recording("ant_2x4"))] for k, v in recording("ant_2x4").items()}
+    spec = mujoco.MjSpec.from_file(str(ant_corridor.MODEL))
+    for x, yaw in ((0, 30), (40, -30), (80, 30)):
+        for y in (5, -5):
+            half = np.radians(yaw) / 2
+            body = spec.worldbody.add_body(pos=[x, y, 1], quat=[np.cos(half), 0, 0, np.sin(half)])
+            body.add_freejoint()
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, size=[20, 0.01, 0.7], density=1e-6, contype=1, conaffinity=1, margin=0
+            )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    errors = []
+    for i in range(len(rows["qpos0"])):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:15], data.qvel[:14], data.ctrl[:] = rows["qpos0"][i], rows["qvel0"][i], rows["action"][i]
+        data.qacc_warmstart[:14] = rows["warm0"][i]
+        mujoco.mj_step(model, data, 5)
+        errors.append(np.abs(data.qvel[:14] - rows["qvel1"][i]).max())
+    assert len(errors) >= 10
+    assert max(errors) < 5e-5
+
+
+def test_model_is_the_original_ant():
+    model = ant_corridor.model()
+    assert (model.nq, model.nv, model.nu, model.nbody) == (15, 14, 8, 14)
+    np.testing.assert_allclose(model.body("torso").mass, 0.327249235, rtol=1e-8)
+    np.testing.assert_allclose(model.body("aux_1").mass, 0.036476928, rtol=1e-7)
+    np.testing.assert_allclose(model.body("aux_1").inertia, [4.585601e-4, 4.585601e-4, 1.167262e-4], rtol=1e-6)
+    np.testing.assert_allclose(model.body("foot_3").mass, 0.064911379, rtol=1e-7)
+    np.testing.assert_allclose(model.body("foot_3").inertia, [2.359040e-3, 2.359040e-3, 2.077164e-4], rtol=1e-6)
+    np.testing.assert_allclose(model.body_mass.sum(), 0.8787, atol=5e-5)
+    ant = model.geom_bodyid > 0
+    assert (model.geom_margin[ant] == 0.01).all() and (model.geom_margin[~ant] == 0).all()  # margins add up
+    assert (model.geom_conaffinity != 0).sum() == 1  # the floor alone: walls are drawn only
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and model.opt.timestep == 0.01
+    motors = [model.actuator(i).name for i in range(8)]
+    assert motors == ["hip_4", "ankle_4", "hip_1", "ankle_1", "hip_2", "ankle_2", "hip_3", "ankle_3"]
+
+
+@pytest.mark.parametrize(("name", "agents", "width"), [("ant_2x4", 2, 31), ("ant_4x2", 4, 33)])
+def test_spec_and_observation(name, agents, width):
+    env = envs.make(name, physics="mujoco")
+    assert env.engine == "mujoco"
+    state = env.reset(jax.random.key(0))
+    spec = env.spec
+    assert (spec.name, spec.num_agents, spec.obs_dim, spec.action_dim) == (name, agents, width, 8 // agents)
+    assert (spec.state_dim, spec.num_costs, spec.horizon, spec.cost_limit) == (29, 1, 1000, 10.0)
+    assert state.obs.shape == (agents, width) and state.global_state.shape == (29,)
+    np.testing.assert_allclose(state.obs.mean(axis=1), 0, atol=1e-6)
+    np.testing.assert_allclose(state.obs.std(axis=1), 1, atol=1e-5)
+    raw = envs.make(name, physics="mujoco", observation="raw").reset(jax.random.key(0))
+    np.testing.assert_array_equal(raw.obs[:, :29], np.broadcast_to(raw.global_state, (agents, 29)))
+    np.testing.assert_array_equal(raw.obs[:, 29:], np.eye(agents))
+
+
+def test_agents_drive_the_motors_in_order():
+    """The effective partition: agents' actions concatenated, whatever the reference's table declares."""
+    two, four = (envs.make(name, physics="mujoco") for name in ("ant_2x4", "ant_4x2"))
+    action = jax.random.uniform(jax.random.key(1), (8,), minval=-1.5, maxval=1.5)
+    start = two.reset(jax.random.key(0))
+    a, b = two.step(start, action.reshape(2, 4)), four.step(four.restore(**two.raw(start)), action.reshape(4, 2))
+    np.testing.assert_array_equal(a.carry.physics.qpos, b.carry.physics.qpos)
+    np.testing.assert_allclose(a.info["reward_ctrl"], -0.5 * np.sum(np.asarray(action) ** 2), rtol=1e-6)
+
+
+def test_restore_is_the_inverse_of_raw():
+    env, _ = stepper("mujoco")
+    step = jax.jit(env.step)
+    state = step(env.reset(jax.random.key(3)), jnp.full((2, 4), 0.3))
+    again = env.restore(**env.raw(state))
+    np.testing.assert_array_equal(again.obs, state.obs)
+    assert jax.tree.structure(again) == jax.tree.structure(state)
+    for ours, theirs in zip(
+        jax.tree.leaves(step(state, jnp.ones((2, 4)))), jax.tree.leaves(step(again, jnp.ones((2, 4)))), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    scaled = env.restore(np.r_[0, 0, 0.75, 2, np.zeros(11)], np.zeros(14))
+    np.testing.assert_array_equal(scaled.carry.physics.qpos[3:7], [1, 0, 0, 0])
+
+
+def test_reset_and_step_have_one_structure_without_weak_types():
+    env, _ = stepper("mujoco")
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    after = jax.eval_shape(env.step, start, jax.ShapeDtypeStruct((2, 4), jnp.float32))
+    assert jax.tree.structure(start) == jax.tree.structure(after)
+    for a, b in zip(jax.tree.leaves(start), jax.tree.leaves(after), strict=True):
+        assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type)
+        assert not b.weak_type
+
+
+def test_reset_draws_what_the_task_says():
+    env, _ = stepper("mujoco")
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 4000))
+    qpos, qvel = np.asarray(states.carry.physics.qpos), np.asarray(states.carry.physics.qvel)
+    offset = qpos - ant_corridor.model().qpos0
+    free = [0, 1, 2, *range(7, 15)]
+    assert 0.098 < np.abs(offset[:, free]).max() <= 0.1 + 1e-6
+    np.testing.assert_allclose(offset[:, free].std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(qvel.std(axis=0), 0.1, rtol=0.06)
+
+
+def test_standing_still_earns_993_and_costs_nothing():
+    env, _ = stepper("mujoco")
+
+    @jax.jit
+    def episode(keys):
+        def step(state, _):
+            state = jax.vmap(env.step)(state, jnp.zeros((len(keys), 2, 4)))
+            return state, (state.reward, state.info["reward_forward"], state.cost[:, 0, 0], state.terminated)
+
+        return jax.lax.scan(step, jax.vmap(env.reset)(keys), None, length=1000)[1]
+
+    reward, forward, cost, terminated = episode(jax.random.split(jax.random.key(0), 4))
+    # The fall from the noisy start drifts by up to half a metre, which is worth 20 a metre.
+    np.testing.assert_allclose((reward - forward).sum(axis=0), 993.5, atol=1.5)
+    np.testing.assert_allclose(reward.sum(axis=0), 993, atol=15)
+    assert not cost.any() and not terminated.any()
+
+
+def plain_danger(x: float, y: float) -> bool:
+    """The cost band as the specification words it, without JAX."""
+    slope = np.tan(np.pi / 6)
+    if x < 20:
+        centre = x * slope
+    elif 20 < x < 60:
+        centre = (40 - x) * slope
+    elif 60 < x < 100:
+        centre = (x - 80) * slope
+    else:
+        centre = 20 * slope
+    return 3.2 < abs(y - centre) < 6.8
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(-150, 150, width=32), st.floats(-30, 30, width=32))
+@example(20.0, 20 * np.tan(np.pi / 6) + 5)
+@example(60.0, 20 * np.tan(np.pi / 6) + 5)  # the quirk: at exactly 60 the centre line jumps up
+@example(60.0, -20 * np.tan(np.pi / 6) + 5)
+@example(100.0, 20 * np.tan(np.pi / 6) - 5)
+@example(-40.0, -40 * np.tan(np.pi / 6) + 6.7)
+def test_danger_band_matches_a_plain_oracle(x, y):
+    off = abs(float(ant_corridor.off_centre(np.float64(x), np.float64(y))))
+    if min(abs(off - 3.2), abs(off - 6.8)) > 1e-4:  # float32 may round either way at the very edge
+        assert bool(ant_corridor.in_danger(np.float64(x), np.float64(y))) == plain_danger(x, y)
+
+
+def test_centre_line_is_continuous_at_the_folds():
+    for x in (20.0, 100.0):
+        left, right = (float(ant_corridor.off_centre(jnp.float32(x + dx), jnp.float32(0.0))) for dx in (-1e-3, 1e-3))
+        assert abs(left - right) < 2e-3
+
+
+def test_broken_physics_terminates_and_shows():
+    env, _ = stepper("mujoco")
+    state = env.step(env.reset(jax.random.key(0)), jnp.full((2, 4), jnp.nan))
+    assert bool(state.terminated) and not np.isfinite(state.reward)
+
+
+def test_fast_solver_stays_near_the_converged_one():
+    rows = recording("ant_2x4")
+    env = envs.make("ant_2x4", physics="mujoco", solver="fast")
+    after = jax.jit(jax.vmap(env.step))(restored(env, rows), rows["action"].reshape(-1, 2, 4).astype(np.float32))
+    error = np.abs(np.asarray(after.carry.physics.qpos) - rows["qpos1"]).max(axis=1)
+    assert np.median(error) < 1e-4 and np.percentile(error, 90) < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"physics": "mujco"}, "did you mean 'mujoco'"),
+        ({"solver": "quick"}, "unknown solver"),
+        ({"observation": "zscor"}, "did you mean 'zscore'"),
+        ({"threads": 0}, "threads must be at least 1"),
+        ({"phisics": "mjx"}, "did you mean 'physics'"),
+    ],
+)
+def test_mistakes_get_one_sentence(options, said):
+    with pytest.raises(TaskError, match=said):
+        envs.make("ant_2x4", **{"physics": "mujoco", **options} if "phisics" not in options else options)

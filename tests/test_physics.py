@@ -1,0 +1,263 @@
+"""The engines: what they promise beyond the numbers of one task."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from envs import ant_corridor, physics
+from envs.errors import TaskError
+
+ROOT = Path(__file__).parents[1]
+READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
+
+
+def engine(**options):
+    return physics.make_engine(ant_corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
+
+
+def starts(count: int, seed: int = 0):
+    """States [count] in the air and on the ground, moving, and random controls."""
+    rng = np.random.default_rng(seed)
+    qpos = np.tile(ant_corridor.model().qpos0, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 15))
+    qpos[:, 2] = rng.uniform(0.3, 0.8, count)
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    qvel, ctrl = rng.normal(size=(count, 14)), rng.uniform(-1.2, 1.2, (count, 8))
+    f32 = jnp.float32
+    state = physics.PhysicsState(jnp.asarray(qpos, f32), jnp.asarray(qvel, f32), jnp.zeros((count, 14), f32))
+    return state, jnp.asarray(ctrl, f32)
+
+
+def assert_same(a, b) -> None:
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def run(script: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """A script in a process of its own, with a working directory that is not written to."""
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def test_numbers_do_not_depend_on_threads_order_or_neighbours():
+    state, ctrl = starts(37)
+    lone = jax.jit(jax.vmap(engine(threads=1).step))(state, ctrl)
+    for threads in (2, 5):
+        assert_same(lone, jax.jit(jax.vmap(engine(threads=threads).step))(state, ctrl))
+    back = jax.tree.map(lambda x: x[::-1], (state, ctrl))
+    assert_same(lone, jax.tree.map(lambda x: x[::-1], jax.jit(jax.vmap(engine(threads=2).step))(*back)))
+
+
+def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
+    state, ctrl = starts(6)
+    step = engine().step
+    flat = jax.jit(jax.vmap(step))(state, ctrl)
+    nested = jax.jit(jax.vmap(jax.vmap(step)))(*jax.tree.map(lambda x: x.reshape(2, 3, -1), (state, ctrl)))
+    assert_same(flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested))
+    shared = jax.jit(jax.vmap(step, in_axes=(0, None)))(state, ctrl[0])
+    assert_same(shared, jax.jit(jax.vmap(step))(state, jnp.tile(ctrl[0], (6, 1))))
+    first = jax.tree.map(lambda x: x[0], (state, ctrl))
+    assert_same(step(*first), jax.tree.map(lambda x: x[0], flat))
+
+
+def test_c_engine_is_a_plain_loop_over_mujoco():
+    state, ctrl = starts(4)
+    after, out = jax.vmap(engine().step)(state, ctrl)
+    model = ant_corridor.model()
+    data = mujoco.MjData(model)
+    for i in range(4):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state.qpos[i], state.qvel[i], ctrl[i]
+        mujoco.mj_step(model, data, 5)
+        mujoco.mj_rnePostConstraint(model, data)
+        np.testing.assert_array_equal(after.qpos[i], data.qpos.astype(np.float32))
+        np.testing.assert_array_equal(after.warmstart[i], data.qacc_warmstart.astype(np.float32))
+        np.testing.assert_array_equal(out["torso"][i], data.xpos[1].astype(np.float32))
+        np.testing.assert_array_equal(out["forces"][i], data.cfrc_ext.astype(np.float32))
+
+
+def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    state, ctrl = starts(8)
+    step = jax.jit(jax.vmap(engine(threads=1).step))
+    healthy = step(state, ctrl)
+    broken = physics.PhysicsState(
+        state.qpos.at[2, 4].set(jnp.nan), state.qvel.at[4].set(1e9).at[5, 0].set(3e38), state.warmstart
+    )
+    after, out = step(broken, ctrl.at[6, 0].set(jnp.inf))
+    assert not np.isfinite(after.qpos[2]).any() and not np.isfinite(after.qpos[6]).any()
+    for row in (4, 5):  # blows up on the way; C would reset it without a word
+        assert not (np.isfinite(after.qpos[row]).all() and np.abs(after.qpos[row]).max() < 1e3)
+    for row in (0, 1, 3, 7):
+        assert_same(
+            jax.tree.map(lambda x, row=row: x[row], (after, out)), jax.tree.map(lambda x, row=row: x[row], healthy)
+        )
+    assert_same(step(state, ctrl), healthy)
+    assert not list(tmp_path.iterdir()), "MuJoCo wrote its log into the working directory"
+
+
+def test_large_batches_in_long_programs_do_not_deadlock():
+    step = jax.vmap(jax.vmap(engine(threads=2).step))
+    state, ctrl = jax.tree.map(lambda x: x.reshape(2, 1024, -1), starts(2048))
+
+    @jax.jit
+    def roll(state):
+        return jax.lax.scan(lambda s, _: (step(s, ctrl)[0], None), state, None, length=3)[0]
+
+    assert np.isfinite(jax.block_until_ready(roll(state)).qpos).all()
+
+
+def test_double_precision_goes_through():
+    done = run("""
+        import jax, numpy as np
+        jax.config.update("jax_enable_x64", True)
+        import envs
+        env = envs.make("ant_2x4", physics="mujoco")
+        state = jax.jit(env.step)(env.reset(jax.random.key(0)), np.zeros((2, 4)))
+        assert state.obs.dtype == state.reward.dtype == np.float64, state.obs.dtype
+        print("ok")
+    """)
+    assert done.stdout.strip().endswith("ok"), done.stderr
+
+
+ROLL = """
+import os, signal, sys, threading, time
+import jax, jax.numpy as jnp, envs
+env = envs.make("ant_2x4", physics="mujoco", threads=2)
+state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))
+zero = jnp.zeros((16, 2, 4))
+roll = jax.jit(lambda s, n: jax.lax.fori_loop(0, n, lambda _, s: jax.vmap(env.step)(s, zero), s))
+jax.block_until_ready(roll(state, 2))
+"""
+
+
+def test_leaves_cleanly_while_a_program_runs():
+    done = run(ROLL + "later = roll(state, 100000)\nprint('leaving')\n")
+    assert done.returncode == 0 and "leaving" in done.stdout, done.stderr
+
+
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork here")
+def test_forked_child_has_its_own_threads():
+    done = run(
+        ROLL
+        + textwrap.dedent("""
+        import numpy as np
+        rows = np.asarray(jnp.concatenate([state.carry.physics.qpos, jnp.zeros((16, 36))], axis=1))
+        def advance():
+            out = np.zeros((16, env._engine._width), np.float32)
+            env._engine._advance(rows, out)
+            return out
+        ours = advance()
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if np.array_equal(advance(), ours) else 1)
+        assert os.waitpid(child, 0)[1] == 0
+        print("ok")
+    """)
+    )
+    assert done.stdout.strip().endswith("ok"), done.stderr
+
+
+def test_interrupt_reaches_python_between_programs():
+    done = run(
+        ROLL
+        + textwrap.dedent("""
+        threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+        begin = time.time()
+        try:
+            while time.time() - begin < 30:
+                state = jax.block_until_ready(roll(state, 20))
+        except KeyboardInterrupt:
+            print("interrupted", time.time() - begin < 10)
+    """)
+    )
+    assert done.returncode == 0 and "interrupted True" in done.stdout, done.stderr
+
+
+def test_hooks_are_where_we_expect_them():
+    physics.check_hooks()
+
+
+def test_hooks_are_put_back_after_tracing():
+    physics.import_mjx()
+    from mujoco.mjx._src import collision_driver, solver
+
+    before = dict(collision_driver._COLLISION_FUNC), solver._while_loop_scan
+    with pytest.raises(ZeroDivisionError), physics._hooked():
+        assert solver._while_loop_scan is not before[1]
+        raise ZeroDivisionError
+    assert (collision_driver._COLLISION_FUNC, solver._while_loop_scan) == before
+
+
+def test_missing_hooks_are_a_clear_error(monkeypatch):
+    physics.import_mjx()
+    from mujoco.mjx._src import solver
+
+    monkeypatch.delattr(solver, "_while_loop_scan")
+    with pytest.raises(TaskError, match="lacks the private hooks"):
+        physics.check_hooks()
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ({"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}, "found mujoco 4.0.0, mujoco-mjx 3.17.0; pip install"),
+        ({"mujoco": "3.17.0", "mujoco-mjx": None}, "mujoco-mjx missing"),
+        ({"mujoco": "3.17.0", "mujoco-mjx": "3.17.1"}, "of the same 3.17"),
+    ],
+)
+def test_wrong_versions_are_refused(monkeypatch, found, said):
+    monkeypatch.setattr(physics, "_version", found.get)
+    with pytest.raises(TaskError, match=said):
+        physics.check_versions()
+
+
+def test_jax_that_deadlocks_is_refused(monkeypatch):
+    monkeypatch.setattr(jax, "__version__", "0.10.1")
+    with pytest.raises(TaskError, match="deadlocks"):
+        physics.check_versions()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="says what a CPU lacks")
+def test_warp_without_a_gpu_is_one_sentence():
+    with pytest.raises(TaskError, match="physics 'warp' needs an NVIDIA GPU; found cpu"):
+        engine(physics="warp")
+    assert physics.explain()["mujoco"] is None and physics.explain()["warp"] is not None
+    assert physics.resolve("auto") == "mujoco"
+
+
+def test_warp_without_its_package_is_one_sentence(monkeypatch):
+    class Gpu:
+        platform, device_kind = "gpu", "NVIDIA H200"
+
+    monkeypatch.setattr(jax, "devices", lambda: [Gpu])
+    monkeypatch.setattr(physics, "_version", lambda _: None)
+    with pytest.raises(TaskError, match=r"needs warp-lang; found none; install it with pip install 'pmt-jax\[warp\]'"):
+        physics.resolve("warp")
+    assert physics.resolve("auto") == "mjx"
+    with pytest.raises(TaskError, match="runs on CPUs only"):
+        physics.resolve("mujoco")
+
+
+def test_room_for_contacts_in_warp():
+    assert physics._room(ant_corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
+
+
+def test_flattened_turns_any_vmap_into_one_batch():
+    doubled = physics._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+
+    def lone(x, y):
+        return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))
+
+    x, y = jnp.arange(6.0).reshape(2, 3), jnp.arange(3.0)
+    value, batch = jax.jit(jax.vmap(jax.vmap(lone), in_axes=(0, None)))(x, y)
+    np.testing.assert_array_equal(value, 2 * x + y)
+    np.testing.assert_array_equal(batch, np.full((2, 3), 6.0))
