@@ -1,0 +1,213 @@
+"""Closed-form numbers of the specification (algorithms, section 8.1)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from pmt_jax import distributions, dual, normalise
+from pmt_jax.coping import clipped_surrogate, hybrid_advantage
+from pmt_jax.fit import fit, huber, untrained, value_loss
+from pmt_jax.returns import gae, standardise
+
+
+def column(x: list[float], dtype: type = float) -> jax.Array:
+    return jnp.asarray(x, dtype)[:, None]
+
+
+def test_gae_bootstraps_at_a_truncation_and_not_at_a_termination():
+    advantage, returns = gae(
+        column([1, 0, 2, 1]),
+        column([1, 2, 0, 4]),
+        column([2, 8, 0, 2]),
+        column([0, 0, 1, 0], bool),
+        column([0, 1, 1, 0], bool),
+        0.5,
+        0.5,
+    )
+    np.testing.assert_allclose(advantage[:, 0], [1.5, 2, 2, -2])
+    np.testing.assert_allclose(returns[:, 0], [2.5, 4, 2, 2])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(-10, 10, width=32), min_size=6, max_size=6), st.floats(0, 1))
+def test_gae_without_decay_is_the_discounted_sum(signal: list[float], discount: float):
+    x, never = column(signal), jnp.zeros((6, 1), bool)
+    value = jnp.arange(1.0, 7.0)[:, None]
+    next_value = jnp.concatenate([value[1:], jnp.zeros((1, 1))])
+    _, returns = gae(x, value, next_value, never, never, discount, 1.0)
+    expected = [sum(discount ** (s - t) * signal[s] for s in range(t, 6)) for t in range(6)]
+    np.testing.assert_allclose(returns[:, 0], expected, atol=1e-3)
+
+
+def test_gae_takes_costs_of_all_agents_at_once():
+    key = jax.random.key(0)
+    x, v, w = jax.random.normal(key, (3, 5, 4, 2, 3))
+    terminated = jax.random.bernoulli(key, 0.2, (5, 4))
+    done = terminated | jax.random.bernoulli(jax.random.key(1), 0.2, (5, 4))
+    together, _ = gae(x, v, w, terminated, done, 0.9, 0.8)
+    alone, _ = gae(x[..., 1, 2], v[..., 1, 2], w[..., 1, 2], terminated, done, 0.9, 0.8)
+    np.testing.assert_allclose(together[..., 1, 2], alone, rtol=1e-6)
+
+
+def test_standardise_centres_and_never_divides_by_less_than_the_floor():
+    x = jnp.asarray([0.0, 0.0, 0.0, 0.04])[:, None]
+    centred, scaled = standardise(x, 0.05)
+    np.testing.assert_allclose(centred.mean(), 0, atol=1e-8)
+    np.testing.assert_allclose(scaled, centred / 0.05, rtol=1e-6)
+    _, unit = standardise(x * 100)
+    np.testing.assert_allclose(unit.std(), 1, rtol=1e-4)
+
+
+def test_forgetting_moments():
+    moments = normalise.forget(normalise.init(()), jnp.asarray([1.0, 3.0]), 0.5)
+    mean, scale = normalise.centre_and_scale(moments)
+    np.testing.assert_allclose([mean, scale, normalise.normalise(moments, jnp.asarray(3.0))], [2, 1, 1], rtol=1e-6)
+    moments = normalise.forget(moments, jnp.asarray([5.0, 7.0]), 0.5)
+    mean, scale = normalise.centre_and_scale(moments)
+    np.testing.assert_allclose([mean, scale**2], [4.66667, 4.55556], rtol=1e-5)
+    np.testing.assert_allclose(normalise.normalise(moments, jnp.asarray(3.0)), -0.780869, rtol=1e-5)
+    np.testing.assert_allclose(normalise.denormalise(moments, normalise.normalise(moments, jnp.asarray(9.0))), 9)
+
+
+def test_moments_of_nothing_normalise_as_the_identity():
+    x = jnp.asarray([3.0, -4.0])
+    np.testing.assert_array_equal(normalise.normalise(normalise.init((2,)), x), x)
+    np.testing.assert_array_equal(normalise.normalise_obs(normalise.init((2,)), x), x)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-1e3, 1e3), st.integers(1, 9))
+def test_accumulated_moments_equal_those_of_everything_seen(offset: float, cut: int):
+    x = offset + np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
+    moments = normalise.init((3,))
+    for part in (x[:cut], x[cut:]):
+        moments = normalise.accumulate(moments, jnp.asarray(part))
+    np.testing.assert_allclose(moments.mean, x.mean(0), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(moments.second, x.var(0), rtol=1e-2, atol=1e-3)
+
+
+def test_huber_is_linear_on_both_sides():
+    np.testing.assert_allclose(huber(jnp.asarray([12.0, -12.0, 2.0])), [70, 70, 2])
+
+
+def test_value_loss_takes_the_worse_of_the_two():
+    loss = value_loss(jnp.asarray(1.0), jnp.asarray(0.0), jnp.asarray(2.0), 0.2)
+    np.testing.assert_allclose(loss, 0.5 * 1.8**2, rtol=1e-6)
+
+
+def test_initial_deviation():
+    np.testing.assert_allclose(distributions.std(jnp.asarray(1.0)), 0.365529, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "factor", "weight", "expected"),
+    [
+        (1.5, 1, 1, 1, 1.2),
+        (1.5, -1, 1, 1, -1.5),
+        (0.5, 1, 1, 1, 0.5),
+        (0.5, -1, 1, 1, -0.8),
+        (1.5, 1, 2, 1, 2.4),
+        (1.15, 1, 1, 0.9, 1.035),
+        (1.4, 1, 1, 0.9, 1.2),
+        (0.85, -1, 1, 0.9, -0.8),
+    ],
+)
+def test_clipped_surrogate(ratio: float, advantage: float, factor: float, weight: float, expected: float):
+    gain = clipped_surrogate(jnp.log(ratio), jnp.log(weight), jnp.asarray(advantage), jnp.asarray(factor), 0.2)
+    np.testing.assert_allclose(gain, expected, rtol=1e-5)
+
+
+def test_gradient_stays_alive_for_small_weights_only():
+    def slope(weight: float) -> jax.Array:
+        return jax.grad(lambda r: clipped_surrogate(r, jnp.log(weight), jnp.asarray(-1.0), jnp.asarray(1.0), 0.2))(0.0)
+
+    assert slope(0.9) != 0
+    assert slope(0.7) == 0
+
+
+def test_hybrid_advantage():
+    np.testing.assert_allclose(
+        hybrid_advantage(jnp.asarray([1.0]), jnp.asarray([[0.4, -0.1]]), jnp.asarray([[0.5, 2.0]])), [1.0], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(("cost_advantage", "expected"), [([0.5, -0.25], 0.805), ([0.5, 0.25], 0.855)])
+def test_dual_update(cost_advantage: list[float], expected: float):
+    surrogate = jnp.mean(jnp.asarray([1.0, 2.0]) * jnp.asarray(cost_advantage))
+    violation = dual.violation(jnp.asarray(30.0), 5.0, 100)
+    np.testing.assert_allclose(dual.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6)
+
+
+def test_dual_update_is_projected():
+    violation = dual.violation(jnp.asarray(0.0), 50.0, 100)
+    assert dual.dual_update(jnp.asarray(0.78), violation, jnp.asarray(0.0), 2.0, 20.0) == 0
+    assert dual.dual_update(jnp.asarray(19.9), -violation, jnp.asarray(0.0), 2.0, 20.0) == 20
+
+
+def test_log_prob_and_entropy_agree_with_scipy():
+    rng = np.random.default_rng(0)
+    action, mean = rng.normal(size=(2, 5, 3))
+    std = np.asarray([0.1, 0.3, 0.5])
+    expected = stats.norm.logpdf(action, mean, std).sum(-1)
+    ones = jnp.ones(3)
+    np.testing.assert_allclose(distributions.log_prob(action, mean, jnp.asarray(std), ones), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        distributions.entropy(jnp.asarray(std), ones), stats.norm.entropy(mean[0], std).sum(), rtol=1e-5
+    )
+
+
+def test_padded_actions_do_not_count():
+    mask = jnp.asarray([1.0, 1.0, 0.0])
+    x, mean, std = jnp.asarray([0.1, 0.2, 9.0]), jnp.zeros(3), jnp.full(3, 0.3)
+    np.testing.assert_allclose(
+        distributions.log_prob(x, mean, std, mask), distributions.log_prob(x[:2], mean[:2], std[:2], mask[:2])
+    )
+    np.testing.assert_allclose(distributions.entropy(std, mask), distributions.entropy(std[:2], mask[:2]))
+    assert distributions.kl(mean, std, mean.at[2].set(5.0), std, mask) == 0
+
+
+def test_kl_and_its_derivatives_at_equal_parameters():
+    mean, std, mask = jnp.asarray([0.1, -0.2]), jnp.asarray([0.2, 0.4]), jnp.ones(2)
+
+    def divergence(m: jax.Array) -> jax.Array:
+        return distributions.kl(mean, std, m, std, mask)
+
+    np.testing.assert_allclose(divergence(mean), 0, atol=1e-7)
+    np.testing.assert_allclose(jax.grad(divergence)(mean), 0, atol=1e-6)
+    np.testing.assert_allclose(jax.hessian(divergence)(mean), np.diag(1 / np.asarray(std) ** 2), rtol=1e-4, atol=1e-4)
+
+
+def test_kl_against_the_textbook():
+    kl = distributions.kl(jnp.asarray([1.0]), jnp.asarray([0.5]), jnp.asarray([0.0]), jnp.asarray([2.0]), jnp.ones(1))
+    np.testing.assert_allclose(kl, np.log(4) + (0.25 + 1) / 8 - 0.5, rtol=1e-5)
+
+
+def test_fit_finds_the_least_squares_solution_and_sees_every_row_in_each_epoch():
+    x = jax.random.normal(jax.random.key(0), (64, 3))
+    weights = jnp.asarray([1.0, -2.0, 0.5])
+
+    def loss(params: jax.Array, rows: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
+        inputs, target = rows
+        return jnp.mean((inputs @ params - target) ** 2), {"mean_target": target.mean()}
+
+    settings_ = {"learning_rate": 0.05, "max_grad_norm": 10.0, "epochs": 100, "minibatches": 4}
+    net, metrics = fit(untrained(jnp.zeros(3)), loss, (x, x @ weights), jax.random.key(1), **settings_)
+    np.testing.assert_allclose(net.params, weights, atol=1e-2)
+    np.testing.assert_allclose(metrics["mean_target"], (x @ weights).mean(), rtol=1e-5)
+
+
+def test_fit_scales_gradients_down_to_the_given_norm():
+    def loss(params: jax.Array, rows: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return 1e6 * params.sum() + 0 * rows.sum(), {}
+
+    one_step = {"learning_rate": 1.0, "epochs": 1, "minibatches": 1}
+    net, metrics = fit(untrained(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step)
+    # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
+    np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)
+    np.testing.assert_allclose(metrics["grad_norm"], 2e6, rtol=1e-5)

@@ -1,0 +1,83 @@
+"""Ends of episodes: time limit, termination, quarantine, auto-reset."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs.toys import Lane
+from envs.vector import VectorEnv
+
+
+class Fragile(Lane):
+    """`lane` that terminates beyond 1 and breaks (nan) when the first action is exactly -1."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        broken = jnp.where(action[0, 0] == -1.0, jnp.nan, 0.0)
+        carry = dataclasses.replace(after.carry, position=after.carry.position + broken)
+        reward, terminated = after.reward + broken, carry.position > 1.0
+        return dataclasses.replace(after, carry=carry, obs=after.obs + broken, reward=reward, terminated=terminated)
+
+
+def test_a_time_limit_truncates_and_keeps_the_true_next_state():
+    vector = VectorEnv(envs.make("lane"), 3, horizon=4)
+    state = vector.reset(jax.random.key(0))
+    step = jax.jit(vector.step)
+    for t in range(4):
+        previous = state
+        state, outcome = step(state, jnp.ones((3, 2, 2)))
+        assert not outcome.terminated.any()
+        assert (outcome.truncated == (t == 3)).all()
+    expected = 2 * (0.8 * previous.env.carry.position + 0.4) - 1
+    np.testing.assert_allclose(outcome.next_global_state[:, 0], expected, rtol=1e-6)  # the true next state ...
+    np.testing.assert_array_equal(state.env.global_state[:, 0], -1)  # ... and the one after the reset
+    np.testing.assert_array_equal(state.elapsed, 0)
+    np.testing.assert_array_equal(state.episode, 1)
+
+
+def test_termination_is_not_truncation_even_on_the_last_step():
+    vector = VectorEnv(Fragile(), 1, horizon=5)
+    state = vector.reset(jax.random.key(0))
+    ends = []
+    for _ in range(5):
+        state, outcome = vector.step(state, jnp.ones((1, 2, 2)))
+        ends.append((bool(outcome.terminated[0]), bool(outcome.truncated[0])))
+    # 0.4, 0.72, 0.976, 1.18: beyond 1 on the fourth step, one before the limit.
+    assert ends == [(False, False)] * 3 + [(True, False), (False, False)]
+    vector = VectorEnv(Fragile(), 1, horizon=4)
+    state = vector.reset(jax.random.key(0))
+    for _ in range(4):
+        state, outcome = vector.step(state, jnp.ones((1, 2, 2)))
+    assert outcome.terminated[0] and not outcome.truncated[0]
+
+
+def test_a_step_that_is_not_finite_is_quarantined_alone():
+    vector = VectorEnv(Fragile(), 2, horizon=9)
+    state = vector.reset(jax.random.key(0))
+    state, _ = vector.step(state, jnp.full((2, 2, 2), 0.5))
+    before = state.env
+    state, outcome = jax.jit(vector.step)(state, jnp.stack([jnp.full((2, 2), -1.0), jnp.full((2, 2), 0.5)]))
+    np.testing.assert_array_equal(outcome.non_finite, [True, False])
+    np.testing.assert_array_equal(outcome.terminated, [True, False])
+    np.testing.assert_array_equal(outcome.reward[0], 0)
+    np.testing.assert_array_equal(outcome.cost[0], 1)
+    np.testing.assert_array_equal(outcome.next_obs[0], before.obs[0])
+    for leaf in jax.tree.leaves((state.env.obs, state.env.carry.position, outcome)):
+        assert np.isfinite(leaf).all()
+    np.testing.assert_array_equal(state.env.carry.position[0], 0)  # started anew
+    np.testing.assert_array_equal(state.elapsed, [0, 2])
+
+
+def test_keys_of_resets_never_repeat():
+    vector = VectorEnv(envs.make("noisy"), 4, horizon=1)
+    state = vector.reset(jax.random.key(0))
+    seen = []
+    for _ in range(5):
+        seen.append(np.asarray(jax.random.key_data(state.env.carry.key)))
+        state, _ = vector.step(state, jnp.zeros((4, 2, 2)))
+    assert len(np.unique(np.concatenate(seen), axis=0)) == 20
