@@ -182,6 +182,31 @@ def test_interrupt_reaches_python_between_programs():
     assert done.returncode == 0 and "interrupted True" in done.stdout, done.stderr
 
 
+def test_interrupt_inside_a_step_never_passes_for_a_result():
+    """XLA runs short programs on the main thread, so Ctrl-C lands in our host function."""
+    done = run(
+        ROLL
+        + textwrap.dedent("""
+        step = jax.jit(env.step)
+        one = jax.tree.map(lambda x: x[0], state)
+        jax.block_until_ready(step(one, zero[0]))
+        for delay in (0.3, 0.4, 0.5):
+            threading.Timer(delay, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+            begin = time.time()
+            try:
+                while time.time() - begin < 20:
+                    jax.block_until_ready(step(one, zero[0]))
+                print("lost")
+            except KeyboardInterrupt:
+                print("interrupted")
+            except RuntimeError as error:
+                assert "interrupted" in str(error), error
+                print("interrupted")
+    """)
+    )
+    assert done.stdout.split().count("interrupted") == 3, done.stdout + done.stderr
+
+
 def test_hooks_are_where_we_expect_them():
     physics.check_hooks()
 

@@ -1,0 +1,218 @@
+"""The learner: equalities between methods, randomness, shapes, and that it learns."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs.toys import Lane
+from pmt_jax import learner, load_config, make_train, rollout
+from pmt_jax.types import LearnerState, Tag
+
+SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
+
+
+@functools.cache
+def small_run(method: str, seeds: int = 1, **overrides) -> tuple[LearnerState, dict[str, jax.Array]]:
+    config = load_config("lane", method=method, **{**SMALL, **overrides})
+    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    return jax.jit(jax.vmap(make_train(config)))(keys)
+
+
+def weights(state: LearnerState):
+    return {"actor": state.actor.params, "critic": state.critic.net.params, "lambda": state.multiplier}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Equalities between methods (specification, section 8.2)
+
+
+def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
+    lagrangian, _ = small_run("mappo_l", lambda_init=0.0, lambda_lr=0.0)
+    plain, _ = small_run("happo")
+    chex.assert_trees_all_equal(weights(lagrangian), weights(plain))
+
+
+def test_a_multiplier_that_acts_makes_a_difference():
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(weights(small_run("mappo_l")[0])["actor"], weights(small_run("happo")[0])["actor"])
+
+
+def test_happo_and_mappo_are_the_same_with_one_agent():
+    happo, _ = small_run("happo", env=(("num_agents", 1),))
+    mappo, _ = small_run("mappo", env=(("num_agents", 1),))
+    chex.assert_trees_all_equal(weights(happo), weights(mappo))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The sequential update
+
+
+def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
+    run = learner.setup(load_config("lane", method="mappo_l", **SMALL))
+    hyper = run.hyper
+    state = learner.init(run, hyper, jax.random.key(0))
+    tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
+    state, batch = learner._act(run, state, tagged[Tag.ACTION])
+    noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
+    rows = learner._policy_rows(run, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob))
+    violation = jnp.asarray([[0.5], [0.25]])
+    actor, multiplier, _ = learner._cope_in_turn(run, hyper, state, rows, violation, tagged)
+
+    factor = jnp.ones_like(rows.factor[0])
+    total = jnp.zeros_like(factor)
+    for i in np.asarray(jax.random.permutation(tagged[Tag.ORDER], 2)):
+        mine = dataclasses.replace(learner._of(rows, i), factor=factor)
+        net, _ = learner._improve(run, hyper, learner._of(state.actor, i), mine, jax.random.fold_in(tagged[Tag.ACTOR], i))
+        chex.assert_trees_all_close(net.params, learner._of(actor.params, i), rtol=1e-5, atol=1e-6)
+        log_ratio = learner._log_ratio(run, net.params, mine)
+        surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
+        expected = 0.78 + hyper.lambda_lr * (violation[i, 0] + surrogate)
+        np.testing.assert_allclose(multiplier[i, 0], expected, rtol=1e-5)
+        factor, total = factor * jnp.exp(log_ratio), total + log_ratio
+    np.testing.assert_allclose(factor, jnp.exp(total), rtol=1e-5)
+    assert jnp.abs(factor - 1).max() > 1e-3
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One program, many seeds
+
+
+def test_a_seed_among_others_is_that_seed_alone():
+    together, metrics = small_run("mappo_l", seeds=3)
+    config = load_config("lane", method="mappo_l", **SMALL)
+    alone, alone_metrics = jax.jit(make_train(config))(jax.random.key(2))
+    third = jax.tree.map(lambda x: x[2], (weights(together), metrics))
+    chex.assert_trees_all_close(third, (weights(alone), alone_metrics), rtol=1e-4, atol=1e-5)
+
+
+def test_seeds_differ():
+    state, _ = small_run("mappo_l", seeds=3)
+    kernel = jax.tree.leaves(state.actor.params)[-1]
+    assert len(np.unique(np.asarray(kernel).reshape(3, -1), axis=0)) == 3
+
+
+def test_jitted_or_not():
+    config = load_config("lane", method="mappo_l", **{**SMALL, "num_envs": 2, "rollout_length": 3, "steps": 6})
+    train = make_train(config)
+    jitted, _ = jax.jit(train)(jax.random.key(0))
+    with jax.disable_jit():
+        plain, _ = train(jax.random.key(0))
+    chex.assert_trees_all_close(weights(jitted), weights(plain), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["mappo", "happo", "mappo_l"])
+def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str):
+    run = learner.setup(load_config("lane", method=method, **SMALL))
+    before = jax.eval_shape(functools.partial(learner.init, run), run.hyper, jax.random.key(0))
+    after, _ = jax.eval_shape(functools.partial(learner.train_step, run), run.hyper, before)
+    chex.assert_trees_all_equal_structs(before, after)
+    for x, y in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        assert not y.weak_type and not x.weak_type
+
+
+def test_hyper_parameters_are_traced_and_can_be_swept():
+    config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 200})
+    train, base = make_train(config), learner.setup(config).hyper
+    sweep = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
+    sweep = dataclasses.replace(sweep, lambda_lr=jnp.asarray([0.0, 0.1, 1.0]))
+    state, _ = jax.jit(jax.vmap(train, (None, 0)))(jax.random.key(0), sweep)
+    assert len(np.unique(np.asarray(state.multiplier[:, 0, 0]))) == 3
+    np.testing.assert_allclose(state.multiplier[0], 0.78)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# More costs than one
+
+
+class TwoDangers(Lane):
+    """`lane` with a second cost: going left of -0.1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spec = dataclasses.replace(self.spec, num_costs=2)
+
+    def _state(self, carry, last_action, reward, cost):
+        state = super()._state(carry, last_action, reward, cost)
+        left = jnp.broadcast_to(carry.position < -0.1, (2, 1)).astype(float)
+        return dataclasses.replace(state, cost=jnp.concatenate([state.cost, left], axis=1))
+
+
+def test_two_costs_have_a_multiplier_each():
+    config = load_config("lane", method="mappo_l", **SMALL)
+    state, _ = jax.jit(make_train(config, TwoDangers()))(jax.random.key(0))
+    assert state.multiplier.shape == (2, 2)
+    assert jnp.abs(state.multiplier[:, 0] - state.multiplier[:, 1]).max() > 1e-5
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Bookkeeping
+
+
+def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
+    run = learner.setup(load_config("lane", **{**SMALL, "rollout_length": 5, "steps": 100}))
+    state = learner.init(run, run.hyper, jax.random.key(0))
+    _, batch = learner._act(run, state, jax.random.key(1))
+    previous = jnp.full((2, 1), 7.0)
+    np.testing.assert_array_equal(rollout.episode_cost_estimate(batch, previous, "episode", 25), previous)
+    rate = rollout.episode_cost_estimate(batch, previous, "rate", 25)
+    np.testing.assert_allclose(rate, 25 * batch.cost.mean((0, 1)))
+    ended = dataclasses.replace(batch, truncated=batch.truncated.at[3, 2].set(True))
+    np.testing.assert_array_equal(
+        rollout.episode_cost_estimate(ended, previous, "episode", 25), batch.episode_cost[3, 2]
+    )
+
+
+def test_episode_figures_count_finished_episodes_only():
+    _, metrics = small_run("happo", rollout_length=10, steps=8 * 10 * 5)
+    # Episodes of 25 steps end in the third and the fifth update of 10 steps.
+    np.testing.assert_array_equal(metrics["episodes"][0], [0, 0, 8, 0, 8])
+    assert np.isnan(metrics["episode_reward"][0, [0, 1, 3]]).all()
+    assert np.isfinite(metrics["episode_reward"][0, [2, 4]]).all()
+    np.testing.assert_array_equal(metrics["episode_length"][0, [2, 4]], 25)
+
+
+def test_observations_are_normalised_with_what_was_seen_before():
+    state, _ = small_run("happo")
+    assert state.obs_moments.weight[0] == 3 * 8 * 25 * 2  # updates, environments, steps, agents
+    assert state.state_moments.weight[0] == 3 * 8 * 25
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Learning (specification, section 8.4)
+
+
+@functools.cache
+def learned(task: str, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mean episode cost and reward of the last 15 of 100 updates, for two seeds."""
+    keys = jax.random.split(jax.random.key(1), 2)
+    _, metrics = jax.jit(jax.vmap(make_train(load_config(task, method=method))))(keys)
+    return tuple(np.asarray(metrics[name])[:, -15:].mean(1) for name in ("episode_cost", "episode_reward"))
+
+
+@pytest.mark.parametrize("task", ["lane", "switch"])
+@pytest.mark.parametrize("method", ["mappo", "happo"])
+def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
+    cost, reward = learned(task, method)
+    assert (cost >= 20).all() and (reward >= 23).all()
+
+
+@pytest.mark.parametrize(("task", "most_cost", "least_reward"), [("lane", 4, 15), ("switch", 3, 7)])
+@pytest.mark.parametrize("method", ["mappo_l"])
+def test_safe_methods_learn_near_the_limit(task: str, method: str, most_cost: float, least_reward: float):
+    cost, reward = learned(task, method)
+    assert (cost <= most_cost).all() and (reward >= least_reward).all()
+
+
+def test_the_environments_of_the_toys_are_what_the_configurations_name():
+    for task in ("lane", "switch", "noisy"):
+        assert load_config(task).task == task
+        assert envs.make(task).spec.name == task
