@@ -199,7 +199,7 @@ def test_interrupt_inside_a_step_never_passes_for_a_result():
                 print("lost")
             except KeyboardInterrupt:
                 print("interrupted")
-            except RuntimeError as error:
+            except (RuntimeError, ValueError) as error:  # jax 0.9 raises the one, jax 0.12 at times the other
                 assert "interrupted" in str(error), error
                 print("interrupted")
     """)

@@ -1,0 +1,192 @@
+"""What a person gets who types: the right thing, or one sentence and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+
+import pytest
+
+TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A finished run of two seeds and 20 updates."""
+    from pmt_jax.cli import main
+
+    out = tmp_path_factory.mktemp("run") / "lane"
+    code = main([str(a) for a in ("train", "lane", *TINY, "--seeds", 2, "--steps", 2000, "--out", out, "--no-cache")])
+    assert code == 0
+    return out
+
+
+def rows(out: pathlib.Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_help_is_quick_and_needs_no_jax():
+    begin = time.monotonic()
+    code = "import sys; from pmt_jax.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    result = subprocess.run(
+        [sys.executable, "-c", code + "assert 'jax' not in sys.modules"], capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    assert "train" in result.stdout and "eval" in result.stdout
+    assert time.monotonic() - begin < 5  # 0.06 s on an idle machine; the bound only notices an import of JAX
+
+
+def test_help_of_train_explains_every_setting():
+    result = subprocess.run([sys.executable, "-m", "pmt_jax.cli", "train", "--help"], capture_output=True, text=True)
+    for flag in ("--lambda-lr", "--num-envs", "--physics", "--env", "--resume"):
+        assert flag in result.stdout
+    assert "step of the multiplier per update" in " ".join(result.stdout.split())
+
+
+def test_a_run_folder(finished: pathlib.Path):
+    assert {p.name for p in finished.iterdir()} == {"config.toml", "metrics.jsonl", "versions.json", "checkpoints"}
+    table = rows(finished)
+    assert [r["step"] for r in table[::2]] == list(range(200, 2001, 200))
+    assert [r["seed"] for r in table[:4]] == [0, 1, 0, 1]
+    names = "step seed task method episode_reward episode_cost cost_limit violation_rate lambda"
+    assert set(names.split()) <= set(table[-1])
+    assert table[-1]["task"] == "lane" and table[-1]["method"] == "mappo_l" and table[-1]["cost_limit"] == 1.0
+    versions = json.loads((finished / "versions.json").read_text())
+    assert versions["jax"] and versions["mujoco"] and versions["matmul_precision"] == "highest"
+
+
+def test_eval_of_a_run(finished: pathlib.Path, cli):
+    code, out, _ = cli("eval", finished, "--episodes", 8, "--deterministic")
+    assert code == 0
+    assert out.count("episode_reward") == 2 and "8 episodes a seed, mean actions" in out
+    assert cli("eval", finished, "--episodes", 8, "--deterministic")[1] == out  # fixed keys
+
+
+def test_training_says_at_once_what_it_does(tmp_path: pathlib.Path, cli):
+    code, out, _ = cli("train", "lane", *TINY, "--steps", 200, "--out", tmp_path / "x", "--no-cache")
+    assert code == 0
+    for word in ("mappo_l on lane", "device cpu", "engine xla", "= 100 a seed", "2 updates", "compiled in", "pmt eval"):
+        assert word in out
+
+
+def test_a_finished_folder_is_never_overwritten(finished: pathlib.Path, cli):
+    before = {p: p.read_bytes() for p in finished.glob("*.*")}
+    code, _, err = cli("train", "lane", "--out", finished)
+    assert code == 2 and "already holds another run" in err
+    assert {p: p.read_bytes() for p in finished.glob("*.*")} == before
+
+
+def test_interrupted_and_resumed_is_as_if_nothing_had_happened(finished: pathlib.Path, tmp_path: pathlib.Path, cli):
+    out = tmp_path / "halves"
+    arguments = ("lane", *TINY, "--seeds", 2, "--out", out, "--no-cache")
+    assert cli("train", *arguments, "--steps", 1000)[0] == 0
+    with (out / "metrics.jsonl").open("a") as file:  # a crash after the checkpoint: rows that will come again
+        file.write('{"step": 1200, "seed": 0}\n{"step": 12')
+    code, text, _ = cli("train", *arguments, "--steps", 2000, "--resume")
+    assert code == 0 and "resuming after 1,000 steps" in text
+    whole, halves = rows(finished), rows(out)
+    for row in whole + halves:
+        del row["seconds"]
+    assert halves == whole
+    from pmt_jax import checkpoint, experiment
+
+    states = [checkpoint.pack(experiment.load_run(folder)[1]) for folder in (finished, out)]
+    assert states[0].keys() == states[1].keys()
+    assert all((states[0][path] == states[1][path]).all() for path in states[0])
+
+
+def test_resuming_with_other_settings_shows_what_differs(finished: pathlib.Path, cli):
+    code, _, err = cli("train", finished / "config.toml", "--out", finished, "--resume", "--clip", 0.1, "--seed", 5)
+    assert code == 2 and "clip: 0.2 -> 0.1" in err and "seed: 0 -> 5" in err
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
+    import signal
+
+    out = tmp_path / "long"
+    command = [sys.executable, "-m", "pmt_jax.cli", "train", "lane", *map(str, TINY), "--steps", "1e8", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
+    deadline = time.monotonic() + 120
+    while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"pmt train {out / 'config.toml'} --out {out} --resume" in text
+    assert len(list((out / "checkpoints").iterdir())) == 1
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
+    out = tmp_path / "broken"
+    code, text, _ = cli("train", "lane", *TINY, "--steps", 2000, "--critic-lr", 1e38, "--out", out, "--no-cache")
+    assert code == 1
+    assert "loss of seed 0 is" in text and "stopped" in text
+    assert rows(out)[-1]["step"] < 2000
+
+
+def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
+    assert "it has no config.toml" in cli("eval", tmp_path)[2]
+    assert "there is no run to resume" in cli("train", "lane", "--out", tmp_path / "x", "--resume")[2]
+    (tmp_path / "config.toml").write_text('task = "lane"\n')
+    code, _, err = cli("eval", tmp_path)
+    assert code == 2 and "there is no finished checkpoint" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["tran", "lane"], "unknown command 'tran'; did you mean 'train'?"),
+        (["train", "lan"], "unknown task 'lan'; did you mean 'lane'? (pmt envs lists all)"),
+        (["train", "ant2x4"], "unknown task 'ant2x4'; did you mean 'ant_2x4'? (pmt envs lists all)"),
+        (["train", "nothing.toml"], "there is no configuration file nothing.toml"),
+        (["train"], "the following arguments are required: TASK|CONFIG"),
+        (["train", "lane", "--lamda-lr", "3"], "unknown argument '--lamda-lr'; did you mean '--lambda-lr'?"),
+        (["train", "lane", "--method", "hapo"], "unknown method 'hapo'; did you mean 'happo'?"),
+        (["train", "lane", "--steps", "-3"], "steps must be at least 1, not -3"),
+        (["train", "lane", "--steps", "10"], "less than one batch"),
+        (["train", "lane", "--clip", "wide"], "clip = 'wide' does not fit: expected a number"),
+        (["train", "lane", "--physics", "mjx"], "is plain JAX and has no physics engine"),
+        (["train", "lane", "--env", "num_agent=3"], "has no option 'num_agent'; did you mean 'num_agents'?"),
+        (["train", "lane", "--resume"], "--resume needs --out"),
+        (["eval", "runs/none", "--episodes", "0"], "--episodes must be a whole number of at least 1"),
+        (["eval", "runs/none"], "runs/none is not a run folder"),
+    ],
+)
+def test_mistakes_get_one_sentence_and_exit_code_2(arguments: list[str], says: str, cli, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = cli(*arguments)
+    assert code == 2
+    assert says in err and err.startswith("pmt: ") and err.count("\n") == 1
+    assert not out
+    assert not list(tmp_path.iterdir())
+
+
+def test_folders_that_cannot_be_used(tmp_path: pathlib.Path, cli):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert "is a file, not a folder" in cli("train", "lane", "--out", file)[2]
+    assert file.read_text() == "mine"
+    assert "cannot write into /proc/run" in cli("train", "lane", "--out", "/proc/run")[2]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    assert "already holds other files" in cli("train", "lane", "--out", tmp_path / "mine")[2]
+
+
+def test_another_package_named_envs_is_noticed(tmp_path: pathlib.Path):
+    (tmp_path / "envs").mkdir()
+    (tmp_path / "envs" / "__init__.py").write_text("")
+    result = subprocess.run(
+        [sys.executable, "-m", "pmt_jax.cli", "train", "lane"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 2
+    assert "another package named 'envs' stands in front of ours" in result.stderr
+    assert result.stderr.count("\n") == 1
