@@ -1,6 +1,6 @@
 """Three constrained tasks small enough for their optimum to be known: the learner's proving ground.
 
-Two agents with two actions each share reward and cost; an episode has 25 steps and never terminates.
+Agents (two of them) with two actions each share reward and cost; an episode has 25 steps and never terminates.
 
 | task | dynamics | reward | cost | optimum at limit 0 / at its limit / unconstrained (its cost) |
 |---|---|---|---|---|
@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .base import EnvSpec, State
+from .errors import TaskError
 
 HORIZON = 25
-NUM_AGENTS = 2
 ACTION_DIM = 2
 
 
@@ -45,21 +45,24 @@ class Lane:
     cost_limit = 1.0
     engine = "xla"
 
-    def __init__(self) -> None:
+    def __init__(self, num_agents: int = 2) -> None:
+        """`num_agents` other than 2 gives a task of the same kind whose optimum is not in the table."""
+        if num_agents < 1:
+            raise TaskError(f"num_agents must be at least 1, not {num_agents}")
         self.spec = EnvSpec(
             name=self.name,
-            num_agents=NUM_AGENTS,
-            obs_dim=2 + NUM_AGENTS * ACTION_DIM + NUM_AGENTS,
+            num_agents=num_agents,
+            obs_dim=2 + num_agents * ACTION_DIM + num_agents,
             action_dim=ACTION_DIM,
-            state_dim=2 + NUM_AGENTS * ACTION_DIM,
+            state_dim=2 + num_agents * ACTION_DIM,
             num_costs=1,
             horizon=HORIZON,
-            action_mask=np.ones((NUM_AGENTS, ACTION_DIM), np.float32),
+            action_mask=np.ones((num_agents, ACTION_DIM), np.float32),
             cost_limit=self.cost_limit,
         )
 
     def reset(self, key: jax.Array) -> State:
-        return self.restore(position=0.0, time=0, last_action=jnp.zeros((NUM_AGENTS, ACTION_DIM)), key=key)
+        return self.restore(position=0.0, time=0, last_action=jnp.zeros(self.spec.action_mask.shape), key=key)
 
     def step(self, state: State, action: jax.Array) -> State:
         action = jnp.clip(action, -1.0, 1.0)
@@ -82,18 +85,19 @@ class Lane:
         return self._state(carry, jnp.asarray(last_action, float), reward=zero, cost=zero)
 
     def raw(self, state: State) -> dict[str, Any]:
-        last_action = state.global_state[1:-1].reshape(NUM_AGENTS, ACTION_DIM)
+        last_action = state.global_state[1:-1].reshape(self.spec.action_mask.shape)
         return {**vars(state.carry), "last_action": last_action}
 
     def _state(self, carry: Carry, last_action: jax.Array, reward: jax.Array, cost: jax.Array) -> State:
         time = carry.time / jnp.asarray(HORIZON, carry.position.dtype)
         seen = jnp.concatenate([(2 * carry.position - 1)[None], last_action.ravel(), time[None]])
-        agent_id = jnp.eye(NUM_AGENTS, dtype=seen.dtype)
+        num_agents = self.spec.num_agents
+        agent_id = jnp.eye(num_agents, dtype=seen.dtype)
         return State(
-            obs=jnp.concatenate([jnp.broadcast_to(seen, (NUM_AGENTS, seen.size)), agent_id], axis=1),
+            obs=jnp.concatenate([jnp.broadcast_to(seen, (num_agents, seen.size)), agent_id], axis=1),
             global_state=seen,
             reward=reward,
-            cost=jnp.broadcast_to(cost, (NUM_AGENTS, 1)),
+            cost=jnp.broadcast_to(cost, (num_agents, 1)),
             terminated=jnp.asarray(False),
             info={"position": carry.position},
             carry=carry,

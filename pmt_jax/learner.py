@@ -40,20 +40,27 @@ class Run:
         return Hyper(**traced)
 
 
-def setup(config: Config) -> Run:
+def setup(config: Config, env: tasks.Env | None = None) -> Run:
     """Builds the task and the networks of a run.
+
+    Args:
+      env: an environment of your own, in place of `config.task`.
 
     Raises:
       UsageError: unknown task or task option, or an engine that cannot run here.
     """
     method = METHODS[config.method]
-    env = tasks.make(config.task, config.physics, **dict(config.env))
+    env = env or tasks.make(config.task, config.physics, **dict(config.env))
     nets = networks.build(config, env.spec, method.share_actor)
     return Run(config, method, tasks.VectorEnv(env, config.num_envs), nets)
 
 
-def make_train(config: Config) -> Train:
+def make_train(config: Config, env: tasks.Env | None = None) -> Train:
     """The whole training as one pure function of a key; vmap it over keys to train seeds, over `hyper` to sweep.
+
+    Args:
+      config: the run's settings.
+      env: an environment of your own, in place of `config.task`.
 
     Returns:
       train: (key, hyper=the config's) -> (LearnerState, Metrics with a leading [updates]).
@@ -66,7 +73,7 @@ def make_train(config: Config) -> Train:
       >>> metrics["violation_rate"].shape
       (2, 1)
     """
-    run = setup(config)
+    run = setup(config, env)
 
     def train(key: jax.Array, hyper: Hyper = run.hyper) -> tuple[LearnerState, Metrics]:
         return train_chunk(run, hyper, init(run, hyper, key), config.num_updates)
