@@ -37,7 +37,7 @@ import threading
 import time
 import warnings
 from collections.abc import Collection, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, Protocol
 
 import jax
@@ -256,6 +256,8 @@ class CEngine:
         _running.append(None)
         try:
             self._advance_rows(argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width))
+        except KeyboardInterrupt:  # XLA runs short programs on the main thread; this cannot unwind through C
+            raise RuntimeError("interrupted in a physics step (Ctrl-C)") from None
         finally:
             _running.pop()
 
@@ -270,7 +272,10 @@ class CEngine:
                 helpers.append(_pool(self._threads).submit(self._work, queue, rows, out))
             except RuntimeError:  # the interpreter is going down and takes no new work: this thread does it all
                 break
-        self._work(queue, rows, out)
+        try:
+            self._work(queue, rows, out)
+        finally:
+            _settle(queue, helpers)
         for helper in helpers:
             helper.result()
 
@@ -342,6 +347,18 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     if threads not in _pools:
         _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="pmt-physics")
     return _pools[threads]
+
+
+def _settle(queue: Iterator[int], helpers: list[Future[None]]) -> None:
+    """Waits until no helper writes into XLA's buffers any more, whatever ended the calling thread's own work."""
+    while True:
+        try:
+            for _ in queue:  # only after a failure is anything left; the helpers then find nothing more to do
+                pass
+            wait(helpers)
+            return
+        except KeyboardInterrupt:  # again: it takes no more than one environment's control step
+            continue
 
 
 @functools.cache
