@@ -70,28 +70,34 @@ def env_alone(physics: str, batch: int, steps: int, **options: Any) -> Callable[
     env = envs.make("ant_2x4", physics=physics, **options)
     spec = env.spec
 
-    def step(carry, _):
-        state, key = carry
-        key, action_key, reset_key = jax.random.split(key, 3)
-        actions = jax.random.uniform(action_key, (batch, spec.num_agents, spec.action_dim), minval=-1, maxval=1)
-        after = jax.vmap(env.step)(state, actions)
-        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, batch))
+    def step(state, action_and_key):
+        action, key = action_and_key
+        after = jax.vmap(env.step)(state, action)
 
-        def either(new, old):
-            return jnp.where(after.terminated.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+        def restarted(after):
+            fresh = jax.vmap(env.reset)(jax.random.split(key, batch))
 
-        return (jax.tree.map(either, fresh, after), key), after.reward.sum()
+            def either(new, old):
+                return jnp.where(after.terminated.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
+            return jax.tree.map(either, fresh, after)
+
+        return jax.lax.cond(after.terminated.any(), restarted, lambda after: after, after), after.reward.sum()
+
+    shape = (steps, batch, spec.num_agents, spec.action_dim)  # drawn beforehand, as the plain loop's are
+    inputs = (
+        jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1),
+        jax.random.split(jax.random.key(2), steps),
+    )
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), batch))
     begin = time.perf_counter()
-    roll = jax.jit(lambda carry: jax.lax.scan(step, carry, None, length=steps)).lower((state, jax.random.key(1)))
-    program = roll.compile()
+    program = jax.jit(lambda state, inputs: jax.lax.scan(step, state, inputs)).lower(state, inputs).compile()
     compile_s = time.perf_counter() - begin
-    carry = [jax.block_until_ready(program((state, jax.random.key(1))))[0]]
+    carry = [jax.block_until_ready(program(state, inputs))[0]]
 
     def measure() -> float:
         begin = time.perf_counter()
-        carry[0], _ = jax.block_until_ready(program(carry[0]))
+        carry[0], _ = jax.block_until_ready(program(carry[0], inputs))
         return steps * batch / (time.perf_counter() - begin)
 
     measure.compile_s = compile_s  # pyright: ignore[reportFunctionMemberAccess]
