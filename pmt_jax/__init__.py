@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .config import Config, load_config
     from .evaluate import evaluate
-    from .learner import init, make_train, setup, train_step
+    from .learner import init, make_train, train_step
     from .methods import METHODS, Method
+    from .run import setup
 
 __version__ = "0.1.0"
 
@@ -24,7 +25,7 @@ _PLACES = {
     "init": "learner",
     "load_config": "config",
     "make_train": "learner",
-    "setup": "learner",
+    "setup": "run",
     "train_step": "learner",
 }
 

@@ -42,6 +42,18 @@ class Hyper:
       lambda_max: upper bound of the multiplier.
       surrogate_weight: weight of the mean of ratio * cost advantage in the multiplier's step.
       cost_std_floor: cost advantages are divided by their deviation, but never by less than this.
+      appraisal_lr: Adam step size of the fear and regret prior networks.
+      fear_l2: weight of fear's squared change of mind since collection (its cognitive error).
+      regret_l2: the same for regret.
+      temperature: of the relaxed samples of the gumbel fear losses.
+      omega: share of an action's entries whose regret counts, or the threshold of regret from which it counts.
+      regret_max: regret is cut here before it weighs on the ratio.
+      kappa: the weight stays within 1 +- kappa * clip; inf for no bound.
+      kl_limit: size of MACPO's trust region, mean KL in nats.
+      damping: added to the Fisher matrix.
+      first_step: first step of MACPO's line search, as a share of the full step.
+      step_decay: each further step of the line search is this much shorter.
+      kl_slack: a step is accepted up to this multiple of kl_limit.
     """
 
     actor_lr: float = 3e-4
@@ -58,6 +70,18 @@ class Hyper:
     lambda_max: float = 20.0
     surrogate_weight: float = 1.0
     cost_std_floor: float = 0.05
+    appraisal_lr: float = 1e-3
+    fear_l2: float = 1.0
+    regret_l2: float = 1.0
+    temperature: float = 0.5
+    omega: float = 0.5
+    regret_max: float = 0.9
+    kappa: float = 0.5
+    kl_limit: float = 0.01
+    damping: float = 0.1
+    first_step: float = 1.0
+    step_decay: float = 0.8
+    kl_slack: float = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +103,15 @@ class Config(Hyper):
       layer_norm: layer normalisation after each hidden layer.
       obs_norm: running moments over the whole run, layer normalisation of the input, or nothing.
       violation: how the episode cost is estimated for the multiplier: mean of the episodes that finished in this
-        update, or the cost rate of this update's steps times the horizon.
+        update, the cost rate of this update's steps times the horizon, or the same of the cost critic's values.
       cost_advantage: standardised (with a floor) or only centred in the policy's loss.
+      fear_time: fear of the state that an action leads to, or of the one it is taken in.
+      fear_loss: cross entropy, or relaxed samples with the divergence from the observed cost forward or reversed.
+      fear_history: which remembered fear a change of mind is measured from: of the same state, or of a random one.
+      regret_mask: which action entries count: the share omega with most regret, those from omega on, or all.
+      regret_target: how deliberate an action was: density relative to the mode, or tail probability.
+      appraisal_epochs: passes over the batch for the fear and regret prior networks.
+      trust_steps: trust-region steps per update, each on its part of the batch.
       physics: which engine simulates; auto takes the fastest for the device.
       env: the task's own options, as name=value.
       log_interval: updates per row of metrics.jsonl.
@@ -99,8 +130,15 @@ class Config(Hyper):
     activation: Literal["relu", "tanh", "elu"] = "relu"
     layer_norm: bool = True
     obs_norm: Literal["running", "layernorm", "none"] = "running"
-    violation: Literal["episode", "rate"] = "episode"
+    violation: Literal["episode", "rate", "critic"] = "episode"
     cost_advantage: Literal["std", "center"] = "std"
+    fear_time: Literal["next", "current"] = "next"
+    fear_loss: Literal["ce", "gumbel_fwd", "gumbel_rev"] = "ce"
+    fear_history: Literal["rollout", "random"] = "rollout"
+    regret_mask: Literal["top", "threshold", "none"] = "top"
+    regret_target: Literal["mode", "tail"] = "mode"
+    appraisal_epochs: int = 4
+    trust_steps: int = 1
     physics: Literal["auto", "mjx", "warp", "mujoco"] = "auto"
     env: tuple[tuple[str, Any], ...] = ()
     log_interval: int = 1

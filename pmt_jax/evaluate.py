@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from . import normalise, tasks
-from .learner import Run
+from .run import Run
 from .types import LearnerState, Metrics
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training

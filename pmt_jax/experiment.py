@@ -26,6 +26,7 @@ from .checkpoint import Checkpoints
 from .config import Config, load_config, to_toml
 from .errors import UsageError
 from .evaluate import evaluate
+from .run import Run, setup
 from .sinks import Jsonl, Progress, Sink, duration
 from .types import LearnerState, Metrics
 
@@ -53,7 +54,7 @@ def train(config: Config, out: pathlib.Path | None, resume: bool = False, cache:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    run = learner.setup(config)
+    run = setup(config)
     out = out or pathlib.Path("runs") / f"{config.task}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
     _open_folder(out, config, resume)
     _announce(run, out, say)
@@ -72,7 +73,7 @@ def train(config: Config, out: pathlib.Path | None, resume: bool = False, cache:
         checkpoints.close()
 
 
-def _announce(run: learner.Run, out: pathlib.Path, say: Say) -> None:
+def _announce(run: Run, out: pathlib.Path, say: Say) -> None:
     config, device = run.config, jax.devices()[0]
     steps = config.num_updates * config.batch_size
     threads = f", {len(os.sched_getaffinity(0))} CPUs" if hasattr(os, "sched_getaffinity") else ""
@@ -167,7 +168,7 @@ def _compile_cache(enabled: bool) -> Iterator[list[str]]:
         jax.monitoring.unregister_event_listener(listen)
 
 
-def _compile(run: learner.Run, cache_events: list[str], say: Say) -> tuple[LearnerState, Chunk]:
+def _compile(run: Run, cache_events: list[str], say: Say) -> tuple[LearnerState, Chunk]:
     """The first state of all seeds, and the compiled program that advances it by one chunk."""
     config, hyper = run.config, run.hyper
     say("compiling ...")
@@ -191,9 +192,7 @@ def _compile(run: learner.Run, cache_events: list[str], say: Say) -> tuple[Learn
 # The loop
 
 
-def _loop(
-    run: learner.Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkpoints: Checkpoints, say: Say
-) -> int:
+def _loop(run: Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkpoints: Checkpoints, say: Say) -> int:
     config = run.config
     done = int(state.update[0])
     sinks: list[Sink] = [Jsonl(out / "metrics.jsonl")]
@@ -226,7 +225,7 @@ def _loop(
     return 0
 
 
-def _rows(run: learner.Run, updates: int, metrics: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+def _rows(run: Run, updates: int, metrics: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """A chunk's metrics as one row per seed: counts are summed over the chunk, the rest averaged, nan left out."""
     config = run.config
     rows = []
@@ -267,12 +266,12 @@ def _broken(rows: list[dict[str, Any]]) -> str | None:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM end the loop after the running chunk; a second Ctrl-C ends the program at once."""
+    """Ctrl-C and SIGTERM end the loop after the running chunk; a second Ctrl-C kills the program at once."""
     received: list[int] = []
 
     def note(number: int, _: types.FrameType | None) -> None:
         received.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # not an exception, which could land inside the physics
 
     try:
         before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -289,7 +288,7 @@ def _interruptible() -> Iterator[list[int]]:
 # Evaluation of a finished run
 
 
-def load_run(folder: pathlib.Path) -> tuple[learner.Run, LearnerState]:
+def load_run(folder: pathlib.Path) -> tuple[Run, LearnerState]:
     """A run's settings and its newest learner state, with a leading [seeds].
 
     Raises:
@@ -297,7 +296,7 @@ def load_run(folder: pathlib.Path) -> tuple[learner.Run, LearnerState]:
     """
     if not (folder / "config.toml").is_file():
         raise UsageError(f"{folder} is not a run folder: it has no config.toml")
-    run = learner.setup(load_config(folder / "config.toml"))
+    run = setup(load_config(folder / "config.toml"))
     keys = jax.vmap(jax.random.key)(jnp.arange(run.config.seeds))
     like = jax.eval_shape(jax.vmap(functools.partial(learner.init, run), (None, 0)), run.hyper, keys)
     checkpoints = Checkpoints(folder)

@@ -28,7 +28,7 @@ def huber(error: jax.Array, delta: float = 10.0) -> jax.Array:
 
 
 def value_loss(value: jax.Array, old_value: jax.Array, target: jax.Array, clip: jax.Array | float) -> jax.Array:
-    """The worse of the Huber losses of the prediction and of its clipped move (specification, section 2.3).
+    """The worse of the Huber losses of the prediction and of its clipped move (Eq. 12).
 
     Args:
       value, old_value, target: [...] in normalised units; clip: how far a value may profit from moving.

@@ -3,56 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from . import distributions, dual, networks, normalise, rollout, tasks
-from .config import HYPER_FIELDS, Config, Hyper
-from .coping import clipped_surrogate, hybrid_advantage
+from . import appraisal, dual, normalise, rollout, tasks
+from .config import Config, Hyper
+from .coping import regret_weight
 from .fit import fit, untrained, value_loss
-from .methods import METHODS, Method
-from .returns import gae, standardise
-from .types import Batch, Critic, LearnerState, Metrics, Params, PolicyRows, Tag, Trained
+from .policy_update import cope, policy_rows
+from .returns import gae
+from .run import Run, setup
+from .types import Batch, Critic, LearnerState, Metrics, Params, Tag, Trained
 
 Train = Callable[..., tuple[LearnerState, Metrics]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What is fixed before training: settings, a row of the method table, the task and the networks' functions."""
-
-    config: Config
-    method: Method
-    vector: tasks.VectorEnv
-    nets: networks.Networks
-
-    @property
-    def hyper(self) -> Hyper:
-        """The numbers of `config` that are traced, as f32 scalars; a cost limit left open is the task's."""
-        values = {name: getattr(self.config, name) for name in HYPER_FIELDS}
-        if math.isnan(values["cost_limit"]):
-            values["cost_limit"] = self.vector.spec.cost_limit
-        traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
-        return Hyper(**traced)
-
-
-def setup(config: Config, env: tasks.Env | None = None) -> Run:
-    """Builds the task and the networks of a run.
-
-    Args:
-      env: an environment of your own, in place of `config.task`.
-
-    Raises:
-      UsageError: unknown task or task option, or an engine that cannot run here.
-    """
-    method = METHODS[config.method]
-    env = env or tasks.make(config.task, config.physics, **dict(config.env))
-    nets = networks.build(config, env.spec, method.share_actor)
-    return Run(config, method, tasks.VectorEnv(env, config.num_envs), nets)
 
 
 def make_train(config: Config, env: tasks.Env | None = None) -> Train:
@@ -96,6 +62,12 @@ def init(run: Run, hyper: Hyper, key: jax.Array) -> LearnerState:
         actor=jax.vmap(untrained)(run.nets.init_actor(tagged[Tag.ACTOR])),
         critic=Critic(untrained(run.nets.init_critic(tagged[Tag.CRITIC])), normalise.init(())),
         cost_critic=Critic(untrained(run.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), normalise.init(heads)),
+        fear=untrained(run.nets.init_fear(tagged[Tag.FEAR])) if run.method.cost_signal == "fear" else None,
+        regret=(
+            jax.vmap(untrained)(run.nets.init_regret(tagged[Tag.REGRET]))
+            if run.method.ratio_weight == "regret"
+            else None
+        ),
         multiplier=jnp.full(heads, hyper.lambda_init * constrained),
         episode_cost=jnp.full(heads, hyper.cost_limit),
         obs_moments=normalise.init((spec.obs_dim,)),
@@ -108,17 +80,15 @@ def init(run: Run, hyper: Hyper, key: jax.Array) -> LearnerState:
 
 def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, cope."""
-    config, horizon = run.config, run.vector.horizon
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
 
     # 1 Information source: the team acts.
     state, batch = _act(run, state, tagged[Tag.ACTION])
-    episode_cost = rollout.episode_cost_estimate(batch, state.episode_cost, config.violation, horizon)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    cost_signal = batch.cost
-    log_weight = jnp.zeros_like(batch.log_prob)
+    fear, cost_signal, fear_metrics = _appraise_fear(run, hyper, state.fear, batch, tagged[Tag.FEAR])
+    regret, log_weight, regret_metrics = _appraise_regret(run, hyper, state.regret, batch, tagged[Tag.REGRET])
 
     # 3 Advantages of reward and of danger.
     value, next_value = _values(state.critic, run.nets.value, batch)
@@ -143,9 +113,9 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
     )
 
     # 5 Coping response: every agent's policy, and the price of danger.
-    rows = _policy_rows(run, hyper, state, batch, advantage, cost_advantage, log_weight)
-    violation = dual.violation(episode_cost, hyper.cost_limit, horizon)
-    cope = {"sequential": _cope_in_turn, "simultaneous": _cope_at_once}[run.method.order]
+    rows = policy_rows(run, hyper, state, batch, advantage, cost_advantage, log_weight)
+    episode_cost = _episode_cost(run, hyper, state, batch, cost_value)
+    violation = dual.violation(episode_cost, hyper.cost_limit, run.vector.horizon)
     actor, multiplier, actor_metrics = cope(run, hyper, state, rows, violation, tagged)
 
     state = dataclasses.replace(
@@ -153,6 +123,8 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
         actor=actor,
         critic=critic,
         cost_critic=cost_critic,
+        fear=fear,
+        regret=regret,
         multiplier=multiplier,
         episode_cost=episode_cost,
         update=state.update + 1,
@@ -164,6 +136,8 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
         **{f"critic/{k}": x for k, x in critic_metrics.items()},
         **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
         **{f"actor/{k}": x for k, x in actor_metrics.items()},
+        **{f"fear/{k}": x for k, x in fear_metrics.items()},
+        **{f"regret/{k}": x for k, x in regret_metrics.items()},
     }
 
 
@@ -190,6 +164,113 @@ def _act(run: Run, state: LearnerState, key: jax.Array) -> tuple[LearnerState, B
     return dataclasses.replace(state, rollout=after, obs_moments=moments[0], state_moments=moments[1]), batch
 
 
+def _appraise_fear(
+    run: Run, hyper: Hyper, net: Trained | None, batch: Batch, key: jax.Array
+) -> tuple[Trained | None, jax.Array, Metrics]:
+    """Learns from the observed costs first, then says how fearful every step was: [T, B, N, K] in (0, 1).
+
+    Without a fear prior network the signal is the cost itself. Calibration is that of the network before it has seen
+    the batch.
+    """
+    if net is None:
+        return None, batch.cost, {}
+    seen = batch.next_state if run.config.fear_time == "next" else batch.state
+    remembered = jax.nn.sigmoid(run.nets.fear(net.params, seen))
+    rows = jax.tree.map(_flat, (seen, batch.cost, remembered))
+    if run.config.fear_history == "random":
+        rows = (*rows[:2], rows[2][jax.random.permutation(jax.random.fold_in(key, 1), rows[2].shape[0])])
+    noise = jax.random.logistic(jax.random.fold_in(key, 2), rows[1].shape)
+
+    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, cost, old, noise = rows
+        logits = run.nets.fear(params, state)
+        distance = appraisal.divergence(logits, cost, run.config.fear_loss, noise, hyper.temperature)
+        return appraisal.appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
+
+    net, metrics = fit(net, loss, (*rows, noise), key, **_appraisal_passes(run, hyper))
+    fear = jax.nn.sigmoid(run.nets.fear(net.params, seen))
+    return net, fear, {**metrics, **appraisal.calibration(remembered, batch.cost)}
+
+
+def _appraise_regret(
+    run: Run, hyper: Hyper, net: Trained | None, batch: Batch, key: jax.Array
+) -> tuple[Trained | None, jax.Array, Metrics]:
+    """Learns how deliberate the costly actions were, then weighs every step's ratio by how regret has changed.
+
+    Returns:
+      the networks of all agents, log w [T, B, N] (0 without regret), and metrics.
+    """
+    if net is None:
+        return None, jnp.zeros_like(batch.log_prob), {}
+    mask = jnp.asarray(run.vector.spec.action_mask)
+    state = jnp.broadcast_to(batch.state[:, :, None], (*batch.log_prob.shape, batch.state.shape[-1]))
+    logits = jax.vmap(run.nets.regret, (0, 2, 2), 2)
+    before = logits(net.params, state, batch.action)
+    target = appraisal.deliberateness((batch.action - batch.mean) / batch.std, run.config.regret_target)
+    target = target * (1 - 2 * appraisal.SMOOTHING) + appraisal.SMOOTHING
+    costly = (batch.cost.max(-1, keepdims=True) > 0) * mask
+    rows = (state, batch.action, target, jax.nn.sigmoid(before), costly)
+    rows = jax.tree.map(lambda x: jnp.moveaxis(_flat(x), 1, 0), rows)
+
+    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, action, target, old, weight = rows
+        logits = run.nets.regret(params, state, action)
+        distance = appraisal.divergence(logits, target, "ce", jnp.zeros_like(logits), 1.0)
+        return appraisal.appraisal_loss(distance, logits, old, weight, hyper.regret_l2), {}
+
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(run.nets.num_agents))
+    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, each[1], each[2], **_appraisal_passes(run, hyper)))(
+        net, rows, keys
+    )
+    # Adam's momentum would move a network that had nothing to learn from.
+    learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
+    after = logits(learned.params, state, batch.action)
+    new, old = appraisal.regret(after, batch.cost), appraisal.regret(before, batch.cost)
+    log_weight = regret_weight(
+        new,
+        old,
+        mask,
+        choose=run.config.regret_mask,
+        omega=hyper.omega,
+        regret_max=hyper.regret_max,
+        bound=hyper.kappa * hyper.clip,
+    )
+    weight = jnp.exp(log_weight)
+    felt = (new * mask).sum() / jnp.maximum(costly.sum(), 1)
+    return (
+        net,
+        log_weight,
+        {
+            **{k: x.mean(0) for k, x in metrics.items()},
+            "on_costly": felt,
+            "weight_mean": weight.mean(),
+            "weight_std": weight.std(),
+        },
+    )
+
+
+def _appraisal_passes(run: Run, hyper: Hyper) -> dict[str, Any]:
+    return {
+        "learning_rate": hyper.appraisal_lr,
+        "max_grad_norm": hyper.max_grad_norm,
+        "epochs": run.config.appraisal_epochs,
+        "minibatches": run.config.minibatches,
+    }
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    """[T, B, ...] as rows [R, ...]."""
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _episode_cost(run: Run, hyper: Hyper, state: LearnerState, batch: Batch, cost_value: jax.Array) -> jax.Array:
+    """The undiscounted cost per episode [N, K] that the constraint is held against."""
+    horizon = run.vector.horizon
+    if run.config.violation == "critic":
+        return (1 - hyper.discount) * horizon * cost_value.mean((0, 1))
+    return rollout.episode_cost_estimate(batch, state.episode_cost, run.config.violation, horizon)
+
+
 ValueFn = Callable[[Params, jax.Array], jax.Array]
 
 
@@ -210,7 +291,7 @@ def _fit_critic(
     returns: jax.Array,
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:
-    """Updates the moments of the returns once, then fits the critic to them in the new units (Eq. 12)."""
+    """Updates the moments of the returns once, then fits the critic to them in the new units."""
     moments = normalise.forget(critic.returns, returns, hyper.value_decay)
     rows = (state, normalise.normalise(moments, old_value), normalise.normalise(moments, returns))
 
@@ -218,118 +299,8 @@ def _fit_critic(
         state, old, target = minibatch
         return value_loss(value_fn(params, state), old, target, hyper.clip).mean(), {}
 
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
-    net, metrics = fit(critic.net, loss, flat, key, learning_rate=hyper.critic_lr, **_passes(run, hyper))
+    passes = {"epochs": run.config.epochs, "minibatches": run.config.minibatches}
+    limits = {"learning_rate": hyper.critic_lr, "max_grad_norm": hyper.max_grad_norm}
+    net, metrics = fit(critic.net, loss, jax.tree.map(_flat, rows), key, **limits, **passes)
     unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
     return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
-
-
-def _passes(run: Run, hyper: Hyper) -> dict[str, Any]:
-    return {"max_grad_norm": hyper.max_grad_norm, "epochs": run.config.epochs, "minibatches": run.config.minibatches}
-
-
-def _policy_rows(
-    run: Run,
-    hyper: Hyper,
-    state: LearnerState,
-    batch: Batch,
-    advantage: jax.Array,
-    cost_advantage: jax.Array,
-    log_weight: jax.Array,
-) -> PolicyRows:
-    """The batch as every agent's policy sees it: leaves [N, R, ...]."""
-    _, advantage = standardise(advantage)
-    centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
-    felt = scaled if run.config.cost_advantage == "std" else centred
-    _, std = run.nets.policies(state.actor.params, batch.obs[0, 0])
-    rows = PolicyRows(
-        obs=batch.obs,
-        action=batch.action,
-        mask=jnp.broadcast_to(jnp.asarray(run.vector.spec.action_mask), batch.action.shape),
-        log_prob=batch.log_prob,
-        mean=batch.mean,
-        std=jnp.broadcast_to(std, batch.action.shape),
-        advantage=hybrid_advantage(advantage[..., None], felt, state.multiplier),
-        cost_advantage=centred,
-        log_weight=log_weight,
-        factor=jnp.ones_like(batch.log_prob),
-    )
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), rows)
-
-
-def _cope_in_turn(
-    run: Run, hyper: Hyper, state: LearnerState, rows: PolicyRows, violation: jax.Array, tagged: dict[Tag, jax.Array]
-) -> tuple[Trained, jax.Array, Metrics]:
-    """Agents improve one after the other in random order, each corrected by what those before it changed (HAPPO)."""
-
-    def one_agent(
-        carry: tuple[Trained, jax.Array, jax.Array], i: jax.Array
-    ) -> tuple[tuple[Trained, jax.Array, jax.Array], Metrics]:
-        actor, multiplier, factor = carry
-        mine = dataclasses.replace(_of(rows, i), factor=factor)
-        net, metrics = _improve(run, hyper, _of(actor, i), mine, jax.random.fold_in(tagged[Tag.ACTOR], i))
-        log_ratio = _log_ratio(run, net.params, mine)
-        price = _price(run, hyper, multiplier[i], mine, violation[i], log_ratio)
-        actor = jax.tree.map(lambda all_, one: all_.at[i].set(one), actor, net)
-        return (actor, multiplier.at[i].set(price), factor * jnp.exp(log_ratio)), metrics
-
-    order = jax.random.permutation(tagged[Tag.ORDER], run.nets.num_agents)
-    start = (state.actor, state.multiplier, jnp.ones_like(rows.factor[0]))
-    (actor, multiplier, _), metrics = jax.lax.scan(one_agent, start, order)
-    return actor, multiplier, jax.tree.map(lambda x: x.mean(0), metrics)
-
-
-def _cope_at_once(
-    run: Run, hyper: Hyper, state: LearnerState, rows: PolicyRows, violation: jax.Array, tagged: dict[Tag, jax.Array]
-) -> tuple[Trained, jax.Array, Metrics]:
-    """All agents improve from the same policies; a shared actor learns from everybody's rows together."""
-    agents = jnp.arange(run.nets.num_actors)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], agents)
-    per_actor = jax.tree.map(lambda x: x.reshape(run.nets.num_actors, -1, *x.shape[2:]), rows)
-    actor, metrics = jax.vmap(lambda net, mine, key: _improve(run, hyper, net, mine, key))(state.actor, per_actor, keys)
-    log_ratio = jax.vmap(lambda net, mine: _log_ratio(run, net.params, mine))(actor, per_actor)
-    log_ratio = log_ratio.reshape(rows.log_prob.shape)
-    price = jax.vmap(lambda *each: _price(run, hyper, *each))(state.multiplier, rows, violation, log_ratio)
-    return actor, price, jax.tree.map(lambda x: x.mean(0), metrics)
-
-
-def _of(tree: Any, i: jax.Array) -> Any:
-    """Agent i's part of a pytree with leading [N]."""
-    return jax.tree.map(lambda x: x[i], tree)
-
-
-def _log_ratio(run: Run, params: Params, rows: PolicyRows) -> jax.Array:
-    """log pi(a|o) - log pi_old(a|o), [R]."""
-    mean, std = run.nets.policy(params, rows.obs)
-    return distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
-
-
-def _improve(run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, key: jax.Array) -> tuple[Trained, Metrics]:
-    """One policy's epochs of clipped policy gradient on its rows."""
-
-    def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
-        mean, std = run.nets.policy(params, rows.obs)
-        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
-        gain = clipped_surrogate(log_ratio, rows.log_weight, rows.advantage, rows.factor, hyper.clip)
-        entropy = distributions.entropy(std, rows.mask).mean()
-        outside = jnp.abs(jnp.exp(log_ratio + rows.log_weight) - 1) > hyper.clip
-        metrics = {
-            "entropy": entropy,
-            "clipped": outside.mean(),
-            "kl": distributions.kl(rows.mean, rows.std, mean, std, rows.mask).mean(),
-            "std": (std * rows.mask).sum() / rows.mask.sum(),
-        }
-        return -gain.mean() - hyper.entropy_coef * entropy, metrics
-
-    return fit(net, loss, rows, key, learning_rate=hyper.actor_lr, **_passes(run, hyper))
-
-
-def _price(
-    run: Run, hyper: Hyper, multiplier: jax.Array, rows: PolicyRows, violation: jax.Array, log_ratio: jax.Array
-) -> jax.Array:
-    """One agent's multipliers [K] after its policy has improved."""
-    if run.method.constraint != "lagrangian":
-        return multiplier
-    ratio = jnp.exp(log_ratio + rows.log_weight)
-    surrogate = hyper.surrogate_weight * jnp.mean(ratio[:, None] * rows.cost_advantage, axis=0)
-    return dual.dual_update(multiplier, violation, surrogate, hyper.lambda_lr, hyper.lambda_max)

@@ -19,12 +19,17 @@ class Method:
     Attributes:
       order: `simultaneous` updates all agents at once; `sequential` updates them one after the other in random order,
         each corrected by the factor M of those before it (HAPPO).
-      constraint: how the cost limit acts: `none`, or a `lagrangian` multiplier per agent and cost.
+      constraint: how the cost limit acts: `none`, a `lagrangian` multiplier per agent and cost, or a `trust_region`
+        whose step keeps within the limit (CPO).
+      cost_signal: what counts as danger in the cost advantage: the `cost` itself, or the `fear` of it.
+      ratio_weight: what biases the probability ratio: nothing, or `regret`.
       share_actor: one actor for all agents (needs equal action spaces and agent ids in the observation).
     """
 
     order: Literal["simultaneous", "sequential"]
-    constraint: Literal["none", "lagrangian"]
+    constraint: Literal["none", "lagrangian", "trust_region"]
+    cost_signal: Literal["cost", "fear"] = "cost"
+    ratio_weight: Literal["none", "regret"] = "none"
     share_actor: bool = False
 
 
@@ -32,4 +37,8 @@ METHODS: dict[str, Method] = {
     "mappo": Method(order="simultaneous", constraint="none", share_actor=True),
     "happo": Method(order="sequential", constraint="none"),
     "mappo_l": Method(order="sequential", constraint="lagrangian"),
+    "macpo": Method(order="sequential", constraint="trust_region"),
+    "f4sg": Method(order="sequential", constraint="lagrangian", cost_signal="fear"),
+    "r4sg": Method(order="sequential", constraint="lagrangian", ratio_weight="regret"),
+    "mixed": Method(order="sequential", constraint="lagrangian", cost_signal="fear", ratio_weight="regret"),
 }

@@ -68,6 +68,8 @@ class Networks:
     actor: Actor
     critic: MLP
     cost_critic: MLP
+    fear_net: MLP
+    regret_net: MLP
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -79,6 +81,15 @@ class Networks:
 
     def init_cost_critic(self, key: jax.Array) -> Params:
         return self.cost_critic.init(key, jnp.zeros(self.state_dim))
+
+    def init_fear(self, key: jax.Array) -> Params:
+        return self.fear_net.init(key, jnp.zeros(self.state_dim))
+
+    def init_regret(self, key: jax.Array) -> Params:
+        """Weights with a leading [num_agents]."""
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_agents))
+        action_dim = self.actor.trunk.outputs
+        return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.state_dim + action_dim)))(keys)
 
     def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
@@ -97,6 +108,15 @@ class Networks:
         """Vc in normalised units: state [..., S] -> [..., N, K]."""
         heads = _apply(self.cost_critic, params, state)
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
+
+    def fear(self, params: Params, state: jax.Array) -> jax.Array:
+        """Logits of the fear prior network: state [..., S] -> [..., N, K]."""
+        heads = _apply(self.fear_net, params, state)
+        return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
+
+    def regret(self, params: Params, state: jax.Array, action: jax.Array) -> jax.Array:
+        """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
+        return _apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
 
 def _apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
@@ -121,4 +141,6 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         actor=Actor(mlp(spec.action_dim, 0.01)),
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
+        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
+        regret_net=mlp(spec.action_dim, 0.01),
     )

@@ -15,7 +15,7 @@ def gae(
     discount: jax.Array | float,
     trace_decay: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Generalised advantage estimation (Schulman et al., 2016).
+    """Generalised advantage estimation (Schulman et al., 2016), of cost (Eq. 8) and fear (Eq. 9) as of reward.
 
     delta_t = signal_t + discount * (1 - terminated_t) * next_value_t - value_t
     A_t     = delta_t + discount * trace_decay * (1 - done_t) * A_{t+1}

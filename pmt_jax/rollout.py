@@ -64,6 +64,7 @@ def collect(
             "action": action,
             "log_prob": distributions.log_prob(action, mean, std, mask),
             "mean": mean,
+            "std": jnp.broadcast_to(std, mean.shape),
             "state": normalise_state(env.global_state),
             "next_state": normalise_state(outcome.next_global_state),
         }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import typing
 from typing import Any
 
 import jax
@@ -19,7 +20,11 @@ Params = Any  # a pytree of network weights; for actors every leaf has a leading
 jax.tree_util.register_dataclass(Hyper, data_fields=HYPER_FIELDS, meta_fields=())
 
 
-def pytree(cls: type) -> type:
+_T = typing.TypeVar("_T", bound=type)
+
+
+@typing.dataclass_transform(frozen_default=True)
+def pytree(cls: _T) -> _T:
     """A frozen dataclass whose fields are a pytree's children."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 
@@ -34,6 +39,8 @@ class Tag(enum.IntEnum):
     ACTOR = 4
     CRITIC = 5
     COST_CRITIC = 6
+    FEAR = 7
+    REGRET = 8
 
 
 @pytree
@@ -80,7 +87,7 @@ class Batch:
 
     Attributes:
       obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
-        under the policy that acted.
+        under the policy that acted; std: [T, B, N, A] likewise.
       state, next_state: [T, B, S]; the next state is the one before any reset.
       reward: [T, B]; cost: [T, B, N, K].
       terminated, truncated: [T, B] bool, never both.
@@ -94,6 +101,7 @@ class Batch:
     action: jax.Array
     log_prob: jax.Array
     mean: jax.Array
+    std: jax.Array
     state: jax.Array
     next_state: jax.Array
     reward: jax.Array
@@ -143,6 +151,8 @@ class LearnerState:
     Attributes:
       actor: weights with a leading agent axis.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
+      fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
+        that do not feel them.
       multiplier: [N, K], lambda.
       episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier answers to.
       obs_moments [O], state_moments [S]: of raw observations and states.
@@ -154,6 +164,8 @@ class LearnerState:
     actor: Trained
     critic: Critic
     cost_critic: Critic
+    fear: Trained | None
+    regret: Trained | None
     multiplier: jax.Array
     episode_cost: jax.Array
     obs_moments: Moments

@@ -13,7 +13,7 @@ import pytest
 
 import envs
 from envs.toys import Lane
-from pmt_jax import learner, load_config, make_train, rollout
+from pmt_jax import learner, load_config, make_train, policy_update, rollout, setup
 from pmt_jax.types import LearnerState, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
@@ -56,23 +56,25 @@ def test_happo_and_mappo_are_the_same_with_one_agent():
 
 
 def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
-    run = learner.setup(load_config("lane", method="mappo_l", **SMALL))
+    run = setup(load_config("lane", method="mappo_l", **SMALL))
     hyper = run.hyper
     state = learner.init(run, hyper, jax.random.key(0))
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     state, batch = learner._act(run, state, tagged[Tag.ACTION])
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
-    rows = learner._policy_rows(run, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob))
+    rows = policy_update.policy_rows(run, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob))
     violation = jnp.asarray([[0.5], [0.25]])
-    actor, multiplier, _ = learner._cope_in_turn(run, hyper, state, rows, violation, tagged)
+    actor, multiplier, _ = policy_update._in_turn(run, hyper, state, rows, violation, tagged)
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)
     for i in np.asarray(jax.random.permutation(tagged[Tag.ORDER], 2)):
-        mine = dataclasses.replace(learner._of(rows, i), factor=factor)
-        net, _ = learner._improve(run, hyper, learner._of(state.actor, i), mine, jax.random.fold_in(tagged[Tag.ACTOR], i))
-        chex.assert_trees_all_close(net.params, learner._of(actor.params, i), rtol=1e-5, atol=1e-6)
-        log_ratio = learner._log_ratio(run, net.params, mine)
+        mine = dataclasses.replace(policy_update._of(rows, i), factor=factor)
+        net, _ = policy_update.improve(
+            run, hyper, policy_update._of(state.actor, i), mine, violation[i], jax.random.fold_in(tagged[Tag.ACTOR], i)
+        )
+        chex.assert_trees_all_close(net.params, policy_update._of(actor.params, i), rtol=1e-5, atol=1e-6)
+        log_ratio = policy_update._moved(run, net.params, mine)[0]
         surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
         expected = 0.78 + hyper.lambda_lr * (violation[i, 0] + surrogate)
         np.testing.assert_allclose(multiplier[i, 0], expected, rtol=1e-5)
@@ -110,7 +112,7 @@ def test_jitted_or_not():
 
 @pytest.mark.parametrize("method", ["mappo", "happo", "mappo_l"])
 def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str):
-    run = learner.setup(load_config("lane", method=method, **SMALL))
+    run = setup(load_config("lane", method=method, **SMALL))
     before = jax.eval_shape(functools.partial(learner.init, run), run.hyper, jax.random.key(0))
     after, _ = jax.eval_shape(functools.partial(learner.train_step, run), run.hyper, before)
     chex.assert_trees_all_equal_structs(before, after)
@@ -121,7 +123,7 @@ def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str
 
 def test_hyper_parameters_are_traced_and_can_be_swept():
     config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 200})
-    train, base = make_train(config), learner.setup(config).hyper
+    train, base = make_train(config), setup(config).hyper
     sweep = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
     sweep = dataclasses.replace(sweep, lambda_lr=jnp.asarray([0.0, 0.1, 1.0]))
     state, _ = jax.jit(jax.vmap(train, (None, 0)))(jax.random.key(0), sweep)
@@ -158,7 +160,7 @@ def test_two_costs_have_a_multiplier_each():
 
 
 def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
-    run = learner.setup(load_config("lane", **{**SMALL, "rollout_length": 5, "steps": 100}))
+    run = setup(load_config("lane", **{**SMALL, "rollout_length": 5, "steps": 100}))
     state = learner.init(run, run.hyper, jax.random.key(0))
     _, batch = learner._act(run, state, jax.random.key(1))
     previous = jnp.full((2, 1), 7.0)

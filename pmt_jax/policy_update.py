@@ -1,0 +1,225 @@
+"""How policies improve on a batch: one after the other or all at once, by clipped epochs or by a trust-region step."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from . import distributions, dual, trust_region
+from .coping import clipped_surrogate, hybrid_advantage
+from .fit import fit
+from .returns import standardise
+from .run import Run
+from .types import Batch, Hyper, LearnerState, Metrics, Params, PolicyRows, Tag, Trained
+
+
+def cope(
+    run: Run, hyper: Hyper, state: LearnerState, rows: PolicyRows, violation: jax.Array, tagged: dict[Tag, jax.Array]
+) -> tuple[Trained, jax.Array, Metrics]:
+    """Every agent's policy improves, and its price of danger follows.
+
+    Args:
+      rows: leaves [N, R, ...]; violation: [N, K] in cost per step.
+
+    Returns:
+      actors, multipliers [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
+    """
+    update = {"sequential": _in_turn, "simultaneous": _at_once}[run.method.order]
+    actor, multiplier, metrics = update(run, hyper, state, rows, violation, tagged)
+    kl = metrics.pop("kl_per_agent")
+    return actor, multiplier, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
+
+
+def policy_rows(
+    run: Run,
+    hyper: Hyper,
+    state: LearnerState,
+    batch: Batch,
+    advantage: jax.Array,
+    cost_advantage: jax.Array,
+    log_weight: jax.Array,
+) -> PolicyRows:
+    """The batch as every agent's policy sees it, leaves [N, R, ...].
+
+    Args:
+      advantage: [T, B]; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
+    """
+    _, advantage = standardise(advantage)
+    centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
+    felt = scaled if run.config.cost_advantage == "std" else centred
+    rows = PolicyRows(
+        obs=batch.obs,
+        action=batch.action,
+        mask=jnp.broadcast_to(jnp.asarray(run.vector.spec.action_mask), batch.action.shape),
+        log_prob=batch.log_prob,
+        mean=batch.mean,
+        std=batch.std,
+        advantage=hybrid_advantage(advantage[..., None], felt, state.multiplier),
+        cost_advantage=centred,
+        log_weight=log_weight,
+        factor=jnp.ones_like(batch.log_prob),
+    )
+    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), rows)
+
+
+def _in_turn(
+    run: Run, hyper: Hyper, state: LearnerState, rows: PolicyRows, violation: jax.Array, tagged: dict[Tag, jax.Array]
+) -> tuple[Trained, jax.Array, Metrics]:
+    """Agents improve one after the other in random order, each corrected by what those before it changed (HAPPO)."""
+
+    def one_agent(
+        carry: tuple[Trained, jax.Array, jax.Array], i: jax.Array
+    ) -> tuple[tuple[Trained, jax.Array, jax.Array], Metrics]:
+        actor, multiplier, factor = carry
+        mine = dataclasses.replace(_of(rows, i), factor=factor)
+        net, metrics = improve(run, hyper, _of(actor, i), mine, violation[i], jax.random.fold_in(tagged[Tag.ACTOR], i))
+        log_ratio, metrics["kl_per_agent"] = _moved(run, net.params, mine)
+        price = _price(run, hyper, multiplier[i], mine, violation[i], log_ratio)
+        actor = jax.tree.map(lambda all_, one: all_.at[i].set(one), actor, net)
+        # The factor corrects the distribution of the executed joint action: no regret weight in it.
+        return (actor, multiplier.at[i].set(price), factor * jnp.exp(log_ratio)), metrics
+
+    order = jax.random.permutation(tagged[Tag.ORDER], run.nets.num_agents)
+    start = (state.actor, state.multiplier, jnp.ones_like(rows.factor[0]))
+    (actor, multiplier, _), metrics = jax.lax.scan(one_agent, start, order)
+    metrics["kl_per_agent"] = metrics["kl_per_agent"][jnp.argsort(order)]
+    return actor, multiplier, metrics
+
+
+def _at_once(
+    run: Run, hyper: Hyper, state: LearnerState, rows: PolicyRows, violation: jax.Array, tagged: dict[Tag, jax.Array]
+) -> tuple[Trained, jax.Array, Metrics]:
+    """All agents improve from the same policies; a shared actor learns from everybody's rows together."""
+    actors = run.nets.num_actors
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
+    per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), rows)
+    violations = violation.reshape(actors, -1, violation.shape[-1]).mean(1)
+    one = jax.vmap(lambda *each: improve(run, hyper, *each))
+    actor, metrics = one(state.actor, per_actor, violations, keys)
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, (run.nets.num_agents, *x.shape[1:])), actor.params)
+    log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: _moved(run, *each))(params, rows)
+    price = jax.vmap(lambda *each: _price(run, hyper, *each))(state.multiplier, rows, violation, log_ratio)
+    return actor, price, metrics
+
+
+def _of(tree: Any, i: jax.Array) -> Any:
+    """Agent i's part of a pytree with leading [N]."""
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def _moved(run: Run, params: Params, rows: PolicyRows) -> tuple[jax.Array, jax.Array]:
+    """How far a policy is from the one that acted: log-ratios [R], and the mean KL(old || new) in nats."""
+    mean, std = run.nets.policy(params, rows.obs)
+    kl = distributions.kl(rows.mean, rows.std, mean, std, rows.mask).mean()
+    return distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob, kl
+
+
+def _price(
+    run: Run, hyper: Hyper, multiplier: jax.Array, rows: PolicyRows, violation: jax.Array, log_ratio: jax.Array
+) -> jax.Array:
+    """One agent's multipliers [K] after its policy has improved."""
+    if run.method.constraint != "lagrangian":
+        return multiplier
+    surrogate = dual.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
+    surrogate = hyper.surrogate_weight * surrogate
+    return dual.dual_update(multiplier, violation, surrogate, hyper.lambda_lr, hyper.lambda_max)
+
+
+def improve(
+    run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, violation: jax.Array, key: jax.Array
+) -> tuple[Trained, Metrics]:
+    """One policy's step on its rows [R, ...], given how far its costs [K] are beyond their limits."""
+    if run.method.constraint == "trust_region":
+        return _trust_region_steps(run, hyper, net, rows, violation, key)
+    return _clipped_epochs(run, hyper, net, rows, key)
+
+
+def _clipped_epochs(run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, key: jax.Array) -> tuple[Trained, Metrics]:
+    """Epochs of clipped policy gradient (PPO)."""
+
+    def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
+        mean, std = run.nets.policy(params, rows.obs)
+        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
+        gain = clipped_surrogate(log_ratio, rows.log_weight, rows.advantage, rows.factor, hyper.clip)
+        entropy = distributions.entropy(std, rows.mask).mean()
+        outside = jnp.abs(jnp.exp(log_ratio + rows.log_weight) - 1) > hyper.clip
+        metrics = {"entropy": entropy, "clipped": outside.mean(), "std": (std * rows.mask).sum() / rows.mask.sum()}
+        return -gain.mean() - hyper.entropy_coef * entropy, metrics
+
+    passes = {"epochs": run.config.epochs, "minibatches": run.config.minibatches}
+    return fit(net, loss, rows, key, learning_rate=hyper.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
+
+
+def _trust_region_steps(
+    run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, violation: jax.Array, key: jax.Array
+) -> tuple[Trained, Metrics]:
+    """`trust_steps` constrained steps (MACPO), each on its part of the shuffled rows; one step takes the whole batch.
+
+    The optimiser's state is not touched. With several costs each step heeds the one most beyond its limit.
+    """
+    start, unravel = ravel_pytree(net.params)
+    spread = rows.cost_advantage.std(0) + 1e-5
+    worst = jnp.argmax(violation / spread)
+    rows = dataclasses.replace(rows, cost_advantage=rows.cost_advantage[:, worst])
+    steps = run.config.trust_steps
+    if steps > 1:
+        shuffle = jax.random.permutation(key, rows.log_prob.shape[0])
+        rows = jax.tree.map(lambda x: x[shuffle], rows)
+    parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), rows)
+
+    def one_step(flat: jax.Array, part: PolicyRows) -> tuple[jax.Array, Metrics]:
+        return _trust_region_step(run, hyper, flat, unravel, part, violation[worst])
+
+    flat, metrics = jax.lax.scan(one_step, start, parts)
+    return Trained(unravel(flat), net.opt_state), jax.tree.map(lambda x: x.mean(0), metrics)
+
+
+def _trust_region_step(
+    run: Run, hyper: Hyper, start: jax.Array, unravel: Any, rows: PolicyRows, violation: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """One constrained step from the flat weights `start` [P]: direction, line search (specification, section 2.9)."""
+
+    def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return run.nets.policy(unravel(flat), rows.obs)
+
+    mean0, std0 = jax.lax.stop_gradient(policy(start))
+
+    def objectives(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Loss and cost surrogates."""
+        mean, std = policy(flat)
+        ratio = jnp.exp(distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob)
+        return -jnp.mean(rows.factor * ratio * rows.advantage), jnp.mean(rows.factor * ratio * rows.cost_advantage)
+
+    def divergence(flat: jax.Array) -> jax.Array:
+        return distributions.kl(mean0, std0, *policy(flat), rows.mask).mean()
+
+    (loss0, cost0), pull = jax.vjp(objectives, start)
+    one, zero = jnp.ones_like(loss0), jnp.zeros_like(loss0)
+    (g,), (b,) = pull((one, zero)), pull((zero, one))
+    _, fisher = jax.linearize(jax.grad(divergence), start)
+    # What the steps before this one are expected to have changed counts towards the limit.
+    c = violation + cost0 - jnp.mean(rows.factor * rows.cost_advantage)
+    direction = trust_region.constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, hyper.kl_limit)
+
+    def accept(flat: jax.Array) -> jax.Array:
+        loss, cost = objectives(flat)
+        kl = divergence(flat)
+        better = (loss < loss0) | (direction.case <= 1)
+        safe = cost - cost0 <= jnp.maximum(-c, 0.0)
+        finite = jnp.isfinite(loss) & jnp.isfinite(cost) & jnp.isfinite(kl)
+        return (kl <= hyper.kl_slack * hyper.kl_limit) & better & safe & finite
+
+    flat, tried = trust_region.backtrack(accept, start, direction.step, hyper.first_step, hyper.step_decay)
+    loss, _ = objectives(flat)
+    _, std = policy(flat)
+    return flat, {
+        "loss": loss,
+        "entropy": distributions.entropy(std, rows.mask).mean(),
+        "std": (std * rows.mask).sum() / rows.mask.sum(),
+        "case": direction.case.astype(loss.dtype),
+        "line_search_steps": tried.astype(loss.dtype),
+    }

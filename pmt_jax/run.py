@@ -1,0 +1,47 @@
+"""What is fixed before training begins."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax.numpy as jnp
+
+from . import networks, tasks
+from .config import HYPER_FIELDS, Config, Hyper
+from .methods import METHODS, Method
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What is fixed before training: settings, a row of the method table, the task and the networks' functions."""
+
+    config: Config
+    method: Method
+    vector: tasks.VectorEnv
+    nets: networks.Networks
+
+    @property
+    def hyper(self) -> Hyper:
+        """The numbers of `config` that are traced, as f32 scalars; a cost limit left open is the task's."""
+        values = {name: getattr(self.config, name) for name in HYPER_FIELDS}
+        if math.isnan(values["cost_limit"]):
+            values["cost_limit"] = self.vector.spec.cost_limit
+        traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+        return Hyper(**traced)
+
+
+def setup(config: Config, env: tasks.Env | None = None) -> Run:
+    """Builds the task and the networks of a run.
+
+    Args:
+      env: an environment of your own, in place of `config.task`.
+
+    Raises:
+      UsageError: unknown task or task option, or an engine that cannot run here.
+    """
+    method = METHODS[config.method]
+    env = env or tasks.make(config.task, config.physics, **dict(config.env))
+    nets = networks.build(config, env.spec, method.share_actor)
+    return Run(config, method, tasks.VectorEnv(env, config.num_envs), nets)
