@@ -1,0 +1,94 @@
+"""Random search over traced settings: all draws train side by side in one program.
+
+    python -m bench.search ant_2x4 --draws 32 --steps 1e6 --vary actor_lr=1e-4:2e-3,lambda_lr=0.3:30 --out found.json \\
+        num_envs=64 env=observation=raw
+
+Settings after the options are fixed for all draws; those of --vary are drawn log-uniformly from their ranges. Without
+any, the draws are plain seeds. Every draw starts from its own seed, so a single good figure may be luck: confirm the
+winner on fresh seeds before believing it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pmt_jax import learner, load_config, setup
+from pmt_jax.run import Run
+
+Ranges = dict[str, tuple[float, float]]  # name -> (lowest, highest)
+
+CURVE = ("episode_reward", "episode_cost", "violation_rate", "lambda", "step_reward", "actor/std", "actor/kl_per_agent")
+
+
+def draw(run: Run, draws: int, seed: int, ranges: Ranges) -> Any:
+    """The run's settings with `draws` random values of those in `ranges`: leaves [draws]."""
+    rng = np.random.default_rng(seed)
+    hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), run.hyper)
+    drawn = {n: jnp.asarray(np.exp(rng.uniform(*np.log(r), draws)), jnp.float32) for n, r in ranges.items()}
+    return dataclasses.replace(hyper, **drawn)
+
+
+def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float) -> dict[str, Any]:
+    """Trains every draw until its steps are done or the time is up; curves have one entry per chunk and draw."""
+    config = run.config
+    keys = jax.vmap(jax.random.key)(jnp.arange(seed, seed + draws))
+    begin = time.monotonic()
+    state = jax.jit(jax.vmap(lambda h, k: learner.init(run, h, k)))(hyper, keys)
+    chunk = jax.jit(jax.vmap(lambda h, s: learner.train_chunk(run, h, s, config.log_interval)), donate_argnums=1)
+    curves: dict[str, list[list[float]]] = {name: [] for name in CURVE}
+    marks = []
+    for done in range(config.num_chunks):
+        state, metrics = chunk(hyper, state)
+        metrics = jax.device_get(metrics)
+        for name in CURVE:
+            values = np.asarray(metrics[name]).reshape(draws, -1)
+            curves[name].append([float(np.nanmean(row)) if np.isfinite(row).any() else None for row in values])
+        marks.append(round(time.monotonic() - begin, 2))
+        if done % 10 == 0:
+            print(f"{config.task} chunk {done + 1}/{config.num_chunks}, {marks[-1]} s", flush=True)
+        if marks[-1] > seconds:
+            break
+    steps = [(i + 1) * config.batch_size * config.log_interval for i in range(len(marks))]
+    rate = draws * (steps[-1] - steps[0]) / max(marks[-1] - marks[0], 1e-9)
+    return {"steps": steps, "seconds": marks, "steps_per_second": rate, "curves": curves}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task")
+    parser.add_argument("--method", default="mappo_l")
+    parser.add_argument("--draws", type=int, default=32)
+    parser.add_argument("--vary", default="", metavar="NAME=LOW:HIGH,...", help="which settings are drawn, from where")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", default="1e6")
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
+    arguments = parser.parse_intermixed_args()
+    fixed: dict[str, Any] = dict(pair.split("=", 1) for pair in arguments.fixed)
+    if "env" in fixed:
+        fixed["env"] = fixed["env"].split(",")
+    jax.config.update("jax_default_matmul_precision", "highest")
+    run = setup(load_config(arguments.task, method=arguments.method, steps=arguments.steps, **fixed))
+    pairs = [pair.split("=") for pair in arguments.vary.split(",") if pair]
+    ranges: Ranges = {name: tuple(map(float, bounds.split(":"))) for name, bounds in pairs}
+    hyper = draw(run, arguments.draws, arguments.seed, ranges)
+    found = search(run, hyper, arguments.draws, arguments.seed, arguments.seconds)
+    found["drawn"] = {n: np.asarray(getattr(hyper, n)).tolist() for n in ranges}
+    found |= {"task": arguments.task, "method": arguments.method, "fixed": arguments.fixed}
+    found |= {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "engine": run.vector.env.engine}
+    arguments.out.write_text(json.dumps(found))
+    print(f"{found['steps_per_second']:,.0f} steps/s over all draws; written to {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()
