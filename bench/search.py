@@ -33,7 +33,7 @@ def draw(run: Run, draws: int, seed: int, ranges: Ranges) -> Any:
     """The run's settings with `draws` random values of those in `ranges`: leaves [draws]."""
     rng = np.random.default_rng(seed)
     hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), run.hyper)
-    drawn = {n: jnp.asarray(np.exp(rng.uniform(*np.log(r), draws)), jnp.float32) for n, r in ranges.items()}
+    drawn = {n: jnp.asarray(np.exp(rng.uniform(np.log(r[0]), np.log(r[1]), draws)), jnp.float32) for n, r in ranges.items()}
     return dataclasses.replace(hyper, **drawn)
 
 
@@ -44,7 +44,7 @@ def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float) -> dict[
     begin = time.monotonic()
     state = jax.jit(jax.vmap(lambda h, k: learner.init(run, h, k)))(hyper, keys)
     chunk = jax.jit(jax.vmap(lambda h, s: learner.train_chunk(run, h, s, config.log_interval)), donate_argnums=1)
-    curves: dict[str, list[list[float]]] = {name: [] for name in CURVE}
+    curves: dict[str, list[list[float | None]]] = {name: [] for name in CURVE}
     marks = []
     for done in range(config.num_chunks):
         state, metrics = chunk(hyper, state)
@@ -80,7 +80,7 @@ def main() -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     run = setup(load_config(arguments.task, method=arguments.method, steps=arguments.steps, **fixed))
     pairs = [pair.split("=") for pair in arguments.vary.split(",") if pair]
-    ranges: Ranges = {name: tuple(map(float, bounds.split(":"))) for name, bounds in pairs}
+    ranges: Ranges = {name: (float(bounds.split(":")[0]), float(bounds.split(":")[1])) for name, bounds in pairs}
     hyper = draw(run, arguments.draws, arguments.seed, ranges)
     found = search(run, hyper, arguments.draws, arguments.seed, arguments.seconds)
     found["drawn"] = {n: np.asarray(getattr(hyper, n)).tolist() for n in ranges}
