@@ -81,6 +81,7 @@ def _add_train(commands: Any) -> None:
     train.add_argument("--out", type=pathlib.Path, help="the run folder (default: runs/TASK-METHOD-TIME)")
     train.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     train.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    train.add_argument("--preset", default="default", help=f"{' | '.join(settings.PRESETS)}")
     group = train.add_argument_group("settings", "each may also stand in the TOML file")
     defaults = settings.Config()
     for name, text in settings.descriptions().items():
@@ -111,7 +112,7 @@ def _add_eval(commands: Any) -> None:
 
 def _train(arguments: argparse.Namespace) -> int:
     given = {k.removeprefix("set_"): v for k, v in vars(arguments).items() if k.startswith("set_") and v is not None}
-    config = settings.load_config(arguments.source, **given)
+    config = settings.load_config(arguments.source, preset=arguments.preset, **given)
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
     _quiet_xla()

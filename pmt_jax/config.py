@@ -110,6 +110,9 @@ class Config(Hyper):
       fear_history: which remembered fear a change of mind is measured from: of the same state, or of a random one.
       regret_mask: which action entries count: the share omega with most regret, those from omega on, or all.
       regret_target: how deliberate an action was: density relative to the mode, or tail probability.
+      regret_response: what regret does to the ratio: the paper's letter (its change weighs on it), one-sided (regret
+        itself weakens what would repeat the action and strengthens what avoids it), or regret weighs the cost
+        advantage instead.
       appraisal_epochs: passes over the batch for the fear and regret prior networks.
       trust_steps: trust-region steps per update, each on its part of the batch.
       physics: which engine simulates; auto takes the fastest for the device.
@@ -137,6 +140,7 @@ class Config(Hyper):
     fear_history: Literal["rollout", "random"] = "rollout"
     regret_mask: Literal["top", "threshold", "none"] = "top"
     regret_target: Literal["mode", "tail"] = "mode"
+    regret_response: Literal["letter", "one_sided", "advantage"] = "letter"
     appraisal_epochs: int = 4
     trust_steps: int = 1
     physics: Literal["auto", "mjx", "warp", "mujoco"] = "auto"
@@ -169,12 +173,40 @@ FIELDS: dict[str, Any] = typing.get_type_hints(Config)
 HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
 
 
-def load_config(source: str | pathlib.Path, method: str | None = None, **overrides: Any) -> Config:
-    """Settings of a task: defaults, then the file, then its [method.NAME] table, then `overrides`.
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    # What the equations literally say; it runs, it need not learn.
+    "paper_letter": {
+        "violation": "critic",
+        "surrogate_weight": "rollout_length",
+        "fear_time": "current",
+        "fear_loss": "gumbel_rev",
+        "kappa": math.inf,
+    },
+    # What the published baselines' code did: a multiplier that stands still, unfloored standardisation, and a short
+    # trust-region step per minibatch.
+    "reference": {
+        "lambda_lr": 0.0,
+        "cost_std_floor": 0.0,
+        "obs_norm": "layernorm",
+        "kl_limit": 0.0065,
+        "first_step": 0.27,
+        "step_decay": 0.5,
+        "kl_slack": 1.0,
+        "trust_steps": "minibatches",
+    },
+}  # a setting's name as a value stands for that setting's value
+
+
+def load_config(
+    source: str | pathlib.Path, method: str | None = None, preset: str = "default", **overrides: Any
+) -> Config:
+    """Settings of a task: defaults, then the file, its [method.NAME] table, the preset, then `overrides`.
 
     Args:
       source: a name in configs/, or the path of a TOML file (a run's own config.toml included).
       method: a name in METHODS; the file's own choice if None.
+      preset: a name in PRESETS.
       **overrides: any field of Config.
 
     Raises:
@@ -194,7 +226,12 @@ def load_config(source: str | pathlib.Path, method: str | None = None, **overrid
     for name in (*tables, method):
         if name not in METHODS:
             raise UsageError(f"unknown method '{name}'{did_you_mean(name, METHODS)}")
+    if preset not in PRESETS:
+        raise UsageError(f"unknown preset '{preset}'{did_you_mean(preset, PRESETS)}")
     values = {**table, **tables.get(method, {}), **overrides, "method": method}
+    for name, value in PRESETS[preset].items():
+        other = values.get(value, getattr(Config, value)) if value in FIELDS else value
+        values = {**values, name: overrides.get(name, other)}
     return Config(**{k: convert(k, v) for k, v in values.items()})
 
 
@@ -303,7 +340,7 @@ def _toml(value: Any) -> str:
 
 
 def _validate(config: Config) -> None:
-    counts = ("steps", "seeds", "num_envs", "rollout_length", "epochs", "minibatches", "log_interval")
+    counts = ("steps", "seeds", "num_envs", "rollout_length", "epochs", "minibatches", "log_interval", "trust_steps")
     for name in counts:
         if getattr(config, name) < 1:
             raise UsageError(f"{name} must be at least 1, not {getattr(config, name)}")
@@ -323,9 +360,16 @@ def _validate(config: Config) -> None:
     for name in ("discount", "trace_decay", "value_decay"):
         if not 0 <= getattr(config, name) <= 1:
             raise UsageError(f"{name} must lie in [0, 1], not {getattr(config, name)}")
-    rates = ("actor_lr", "critic_lr", "lambda_init", "lambda_lr", "lambda_max")
+    rates = ("actor_lr", "critic_lr", "appraisal_lr", "fear_l2", "regret_l2", "lambda_init", "lambda_lr", "lambda_max")
     for name in (*rates, "entropy_coef", "clip", "max_grad_norm", "surrogate_weight", "cost_std_floor"):
         if not 0 <= getattr(config, name) < math.inf:
             raise UsageError(f"{name} must be a number that is not negative, not {getattr(config, name)}")
+    for name in ("kappa", "omega", "temperature", "damping", "kl_limit", "first_step", "step_decay", "kl_slack"):
+        if not getattr(config, name) >= 0:
+            raise UsageError(f"{name} must be a number that is not negative, not {getattr(config, name)}")
+    if not 0 <= config.regret_max < 1:
+        raise UsageError(f"regret_max must lie in [0, 1), not {config.regret_max}")
+    if config.batch_size % config.trust_steps:
+        raise UsageError(f"a batch of {config.batch_size} steps cannot be cut into {config.trust_steps} trust steps")
     if config.cost_limit < 0 or math.isinf(config.cost_limit):
         raise UsageError(f"cost_limit must be a cost per episode of at least 0, not {config.cost_limit}")

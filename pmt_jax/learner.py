@@ -226,6 +226,8 @@ def _appraise_regret(
     learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
     after = logits(learned.params, state, batch.action)
     new, old = appraisal.regret(after, batch.cost), appraisal.regret(before, batch.cost)
+    if run.config.regret_response != "letter":  # the other responses answer to regret itself, not to its change
+        old = jnp.zeros_like(new)
     log_weight = regret_weight(
         new,
         old,

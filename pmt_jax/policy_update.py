@@ -51,6 +51,11 @@ def policy_rows(
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
     felt = scaled if run.config.cost_advantage == "std" else centred
+    if run.config.regret_response == "advantage":
+        felt, log_weight = felt * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
+    hybrid = hybrid_advantage(advantage[..., None], felt, state.multiplier)
+    if run.config.regret_response == "one_sided":
+        log_weight = log_weight * jnp.sign(hybrid)
     rows = PolicyRows(
         obs=batch.obs,
         action=batch.action,
@@ -58,7 +63,7 @@ def policy_rows(
         log_prob=batch.log_prob,
         mean=batch.mean,
         std=batch.std,
-        advantage=hybrid_advantage(advantage[..., None], felt, state.multiplier),
+        advantage=hybrid,
         cost_advantage=centred,
         log_weight=log_weight,
         factor=jnp.ones_like(batch.log_prob),

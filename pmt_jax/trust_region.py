@@ -62,14 +62,17 @@ def constrained_direction(g: jax.Array, b: jax.Array, c: jax.Array, hvp: Hvp, de
     v, w = conjugate_gradient(hvp, g), conjugate_gradient(hvp, b)
     c = jnp.where(c == 0, EPS, c)
     q, r, s = g @ v, g @ w, b @ w
-    a_ = jnp.maximum(q - r**2 / (s + EPS), 0.0)
+    # Rounding makes parallel g and b look anything from a little to not at all different; both end here.
+    a_ = jnp.maximum(q - r**2 / (s + EPS), 8 * jnp.finfo(q.dtype).eps * q)
     b_ = 2 * delta - c**2 / (s + EPS)
     no_cost = (b @ b <= EPS) & (c < 0)
     case = jnp.where(no_cost, 4, jnp.where(c < 0, jnp.where(b_ < 0, 3, 2), jnp.where(b_ < 0, 0, 1)))
     lam, nu = _dual(q, r, s, c, a_, b_, delta)
     free = jnp.sqrt(jnp.maximum(q, 0.0) / (2 * delta))
     lam, nu = jnp.where(case >= 3, free, lam), jnp.where(case >= 3, 0.0, nu)
-    optimal = -(v + nu * w) / (lam + EPS)
+    # With nu > 0 this is -(v + nu w) / lam, rid of the cancellation between v and nu w.
+    across = v - r / (s + EPS) * w
+    optimal = jnp.where(nu > 0, -across / (lam + EPS) - c / (s + EPS) * w, -v / (lam + EPS))
     recovery = -jnp.sqrt(2 * delta / (s + EPS)) * w
     return Direction(jnp.where(case == 0, recovery, optimal), case)
 

@@ -108,7 +108,18 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
     import signal
 
     out = tmp_path / "long"
-    command = [sys.executable, "-m", "pmt_jax.cli", "train", "lane", *map(str, TINY), "--steps", "1e8", "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "pmt_jax.cli",
+        "train",
+        "lane",
+        *map(str, TINY),
+        "--steps",
+        "1e8",
+        "--out",
+        str(out),
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
     deadline = time.monotonic() + 120
     while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():

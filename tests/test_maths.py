@@ -141,7 +141,9 @@ def test_hybrid_advantage():
 def test_dual_update(cost_advantage: list[float], expected: float):
     surrogate = jnp.mean(jnp.asarray([1.0, 2.0]) * jnp.asarray(cost_advantage))
     violation = dual.violation(jnp.asarray(30.0), 5.0, 100)
-    np.testing.assert_allclose(dual.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        dual.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6
+    )
 
 
 def test_dual_update_is_projected():
@@ -207,7 +209,9 @@ def test_fit_scales_gradients_down_to_the_given_norm():
         return 1e6 * params.sum() + 0 * rows.sum(), {}
 
     one_step = {"learning_rate": 1.0, "epochs": 1, "minibatches": 1}
-    net, metrics = fit(untrained(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step)
+    net, metrics = fit(
+        untrained(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step
+    )
     # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
     np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)
     np.testing.assert_allclose(metrics["grad_norm"], 2e6, rtol=1e-5)

@@ -1,0 +1,190 @@
+"""Fear and regret: closed forms, calibration, and what each equation is."""
+
+from __future__ import annotations
+
+import ast
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import pmt_jax
+from pmt_jax import appraisal
+from pmt_jax.coping import regret_weight
+
+TOP = {"choose": "top", "regret_max": 0.9}
+
+
+def test_bernoulli_divergence():
+    np.testing.assert_allclose(appraisal.bernoulli_kl(jnp.asarray(0.5), jnp.asarray(0.25)), 0.143841, rtol=1e-5)
+    np.testing.assert_allclose(appraisal.bernoulli_kl(jnp.asarray(0.25), jnp.asarray(0.5)), 0.130812, rtol=1e-5)
+    assert np.isfinite(appraisal.bernoulli_kl(jnp.asarray(1.0), jnp.asarray(0.0)))
+
+
+def test_deliberateness():
+    z = jnp.asarray([0.0, 1.0, 2.0])
+    np.testing.assert_allclose(appraisal.deliberateness(z, "mode"), [1, 0.606531, 0.135335], rtol=1e-5)
+    np.testing.assert_allclose(appraisal.deliberateness(z, "tail"), [1, 0.317311, 0.045500], rtol=1e-4)
+
+
+def test_mean_of_a_relaxed_sample():
+    noise = jax.random.logistic(jax.random.key(0), (400_000,))
+    np.testing.assert_allclose(appraisal.relaxed_bernoulli(jnp.asarray(1.3), noise, 1.0).mean(), 0.705158, atol=2e-3)
+
+
+def weigh(new: list[float], old: list[float], omega: float = 2 / 3, bound: float = jnp.inf, **changes) -> jax.Array:
+    mask = jnp.ones(len(new))
+    options = {**TOP, "omega": omega, "bound": bound, **changes}
+    return regret_weight(jnp.asarray(new), jnp.asarray(old), mask, **options)
+
+
+def test_regret_weight():
+    log_weight = weigh([0.5, 0.2, 0.1], [0.25, 0.1, 0.0])
+    np.testing.assert_allclose(log_weight, -0.523248, rtol=1e-5)
+    np.testing.assert_allclose(jnp.exp(log_weight), 0.592593, rtol=1e-5)
+    np.testing.assert_allclose(jnp.exp(weigh([0.5, 0.2, 0.1], [0.25, 0.1, 0.0], bound=0.1)), 0.9, rtol=1e-6)
+
+
+def test_no_regret_has_no_weight_at_all():
+    assert weigh([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]) == 0
+    assert weigh([0.3, 0.2, 0.1], [0.3, 0.2, 0.1]) == 0
+
+
+def test_regret_masks():
+    new, old = [0.5, 0.2, 0.2], [0.0, 0.0, 0.0]
+    logs = np.log1p(-np.asarray(new))
+    np.testing.assert_allclose(weigh(new, old, omega=1 / 3), logs[0], rtol=1e-5)
+    np.testing.assert_allclose(weigh(new, old, omega=2 / 3), logs.sum(), rtol=1e-5)  # ties all count
+    np.testing.assert_allclose(weigh(new, old, omega=0.3, choose="threshold"), logs[0], rtol=1e-5)
+    np.testing.assert_allclose(weigh(new, old, choose="none"), logs.sum(), rtol=1e-5)
+    np.testing.assert_allclose(weigh([1.0], [0.0], omega=1.0), np.log(0.1), rtol=1e-5)
+
+
+def test_padded_actions_have_no_regret():
+    mask = jnp.asarray([1.0, 1.0, 0.0])
+    with_padding = regret_weight(
+        jnp.asarray([0.1, 0.2, 0.8]), jnp.zeros(3), mask, choose="top", omega=0.5, regret_max=0.9, bound=jnp.inf
+    )
+    np.testing.assert_allclose(with_padding, np.log(0.8), rtol=1e-5)
+
+
+def test_regret_is_felt_only_where_it_cost():
+    logits, cost = jnp.asarray([[2.0, -1.0], [2.0, -1.0]]), jnp.asarray([[1.0], [0.0]])
+    felt = appraisal.regret(logits, cost)
+    np.testing.assert_allclose(felt[0], jax.nn.sigmoid(logits[0]))
+    np.testing.assert_array_equal(felt[1], 0)
+
+
+def test_calibration():
+    p, y = jnp.asarray([0.05, 0.05, 0.95, 0.95]), jnp.asarray([0.0, 0.0, 1.0, 0.0])
+    figures = appraisal.calibration(p, y)
+    np.testing.assert_allclose(figures["brier"], (2 * 0.05**2 + 0.05**2 + 0.95**2) / 4, rtol=1e-5)
+    np.testing.assert_allclose(figures["ece"], (0.1 + 0.9) / 4, rtol=1e-5)
+    np.testing.assert_allclose(figures["on_costly"], 0.95, rtol=1e-6)
+    np.testing.assert_allclose(figures["on_safe"], 1.05 / 3, rtol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Tabular appraisal (specification, section 8.3)
+
+PROBABILITY = np.asarray([0.0, 0.02, 0.3, 1.0])
+
+
+def tabular(loss: str, l2: float = 0.0, steps: int = 300, remembered: str = "self") -> np.ndarray:
+    """Fear of four states after `steps` of Adam on 4,096 rows of observed costs."""
+    state = jnp.tile(jnp.arange(4), 1024)
+    key = jax.random.key(0)
+    cost = jax.random.bernoulli(key, jnp.asarray(PROBABILITY)[state]).astype(float)
+    adam = optax.adam(5e-2)
+
+    def objective(logits: jax.Array, key: jax.Array) -> jax.Array:
+        mine = logits[state]
+        noise = jax.random.logistic(key, mine.shape)
+        distance = appraisal.divergence(mine, cost, loss, noise, 0.5)  # pyright: ignore
+        old = jax.lax.stop_gradient(jax.nn.sigmoid(mine)) if remembered == "self" else jnp.zeros_like(mine)
+        return appraisal.appraisal_loss(distance, mine, old, jnp.ones_like(mine), l2)
+
+    def step(carry, key):
+        logits, opt = carry
+        update, opt = adam.update(jax.grad(objective)(logits, key), opt)
+        return (optax.apply_updates(logits, update), opt), None
+
+    start = jnp.zeros(4)
+    (logits, _), _ = jax.jit(lambda s: jax.lax.scan(step, s, jax.random.split(key, steps)))((start, adam.init(start)))
+    return np.asarray(jax.nn.sigmoid(logits))
+
+
+def test_cross_entropy_is_calibrated():
+    np.testing.assert_allclose(tabular("ce"), PROBABILITY, atol=0.03)
+
+
+def test_forward_divergence_of_samples_is_nearly_calibrated():
+    np.testing.assert_allclose(tabular("gumbel_fwd"), PROBABILITY, atol=0.06)
+
+
+def test_the_letter_of_the_paper_does_not_fear_what_is_rare():
+    fear = tabular("gumbel_rev")
+    assert fear[2] < 0.05  # a cost three times in ten
+    assert fear[3] > 0.95
+
+
+def test_remembering_oneself_leaves_fear_unbiased_and_remembering_nothing_does_not():
+    np.testing.assert_allclose(tabular("ce", l2=1.0), tabular("ce"), atol=0.02)
+    shrunk = tabular("ce", l2=1.0, steps=2000, remembered="zero")
+    np.testing.assert_allclose(shrunk, [0.001, 0.025, 0.216, 0.707], atol=0.03)
+    shrunk = tabular("ce", l2=10.0, steps=2000, remembered="zero")
+    np.testing.assert_allclose(shrunk, [0.002, 0.019, 0.102, 0.224], atol=0.03)
+
+
+def test_without_weight_there_is_no_loss_and_no_gradient():
+    logits, target = jnp.asarray([0.3, -2.0]), jnp.asarray([0.9, 0.1])
+
+    def objective(logits: jax.Array) -> jax.Array:
+        distance = appraisal.divergence(logits, target, "ce", jnp.zeros(2), 1.0)
+        return appraisal.appraisal_loss(distance, logits, jnp.zeros(2), jnp.zeros(2), 1.0)
+
+    assert objective(logits) == 0
+    np.testing.assert_array_equal(jax.grad(objective)(logits), 0)
+
+
+def test_regret_learns_how_deliberate_a_costly_action_was():
+    import flax.linen as nn
+
+    from pmt_jax.fit import fit, untrained
+
+    action = jax.random.normal(jax.random.key(0), (8192, 1))
+    target = appraisal.deliberateness(action, "mode")
+    net = nn.Sequential([nn.Dense(32), nn.tanh, nn.Dense(32), nn.tanh, nn.Dense(1)])
+
+    def loss(params, rows):
+        x, p = rows
+        logits: jax.Array = net.apply(params, x)  # pyright: ignore
+        distance = appraisal.divergence(logits, p, "ce", jnp.zeros_like(p), 1.0)
+        return appraisal.appraisal_loss(distance, logits, p, jnp.ones_like(p), 0.0), {}
+
+    start = untrained(net.init(jax.random.key(1), action[:1]))
+    options = {"learning_rate": 5e-3, "max_grad_norm": 10.0, "epochs": 60, "minibatches": 8}
+    trained, _ = fit(start, loss, (action, target), jax.random.key(2), **options)
+    probe = jnp.linspace(-2, 2, 41)[:, None]
+    regret = jax.nn.sigmoid(net.apply(trained.params, probe))  # pyright: ignore
+    np.testing.assert_allclose(regret, jnp.exp(-0.5 * probe**2), atol=0.05)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The paper's equations
+
+
+@pytest.mark.parametrize("number", [3, 4, *range(8, 18)])
+def test_every_equation_is_one_function(number: int):
+    named = []
+    for path in pathlib.Path(pmt_jax.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                for numbers in re.findall(r"Eq\. (\d+(?:, \d+)*)", ast.get_docstring(node) or ""):
+                    if str(number) in numbers.split(", "):
+                        named.append(f"{path.name}:{node.name}")
+    assert len(named) == 1, named
