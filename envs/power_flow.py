@@ -10,7 +10,7 @@ Example:
   >>> network = load_network("case33")
   >>> flow = solve(network, jnp.full(33, -0.1), jnp.full(33, -0.05))     # consumption is negative
   >>> bool(flow.converged), round(float(flow.vm_pu.min()), 3)
-  (True, 0.929)
+  (True, 0.904)
 """
 
 from __future__ import annotations
