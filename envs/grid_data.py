@@ -1,7 +1,7 @@
 """Load and solar profiles for the voltage-control tasks: measured, generated, or a user's own folder in MAPDN's format.
 
-A row is 3 minutes. Profiles may be stored as coarser knots (15 minutes); the environment interpolates between them while
-it runs, as MAPDN did once and for all when it made its files.
+A row is 3 minutes. Profiles may be stored as coarser knots (15 minutes); the environment interpolates between them
+while it runs, as MAPDN did once and for all when it made its files.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ MINUTES = 3  # of a row
 ROWS_PER_DAY = 24 * 60 // MINUTES
 KNOT_ROWS = 5  # rows between the 15-minute knots of measured and generated profiles
 FILES = ("load_active.csv", "load_reactive.csv", "pv_active.csv")
-# MW, largest sum of all loads. MAPDN's README states 3.5 and 20; these make the zero, random and droop policies reach the
-# figures that are published for the genuine data (docs/voltage.md has them side by side).
+# MW, largest sum of all loads. MAPDN's README states 3.5 and 20; these make the zero, random and droop policies reach
+# the figures that are published for the genuine data (docs/voltage.md has them side by side).
 PEAK_LOAD = {
     ("simbench", "case33"): 3.15,
     ("simbench", "case141"): 18.0,
@@ -128,8 +128,8 @@ def _from_disk(path: Path, num_loads: int, num_pvs: int) -> Profiles:
 def load_folder(path: Path, num_loads: int, num_pvs: int) -> Profiles:
     """The three csv files of a MAPDN data folder: a first column of times, then one column per load or PV, MW or MVAr.
 
-    Column headers do not matter, order does: loads by ascending bus, PVs in the order of the agents. The folder's `model.p`
-    is not read (see `unpickle_network`).
+    Column headers do not matter, order does: loads by ascending bus, PVs in the order of the agents. The folder's
+    `model.p` is not read (see `unpickle_network`).
 
     Raises:
       TaskError: a file that is missing or malformed, other columns than the network has, unequal or irregular times,
@@ -218,8 +218,7 @@ def save_profiles(path: str | Path, profiles: Profiles) -> None:
 def at_knots(profiles: Profiles, tolerance: float = 2e-6) -> Profiles | None:
     """The 15-minute knots of 3-minute rows, or None where rows stray from straight lines by more than `tolerance` MW.
 
-    MAPDN's files begin at minute 3, their knots are rows 4, 9, ...; whole knots remain, other rows at the ends are dropped
-    only if there are none, that is, never: such profiles are left alone.
+    Knots are rows 0, 5, 10, ...; profiles whose straight lines break at other rows are left alone.
     """
     if profiles.rows_per_knot != 1 or profiles.num_rows % KNOT_ROWS != 1:
         return None
@@ -247,7 +246,7 @@ def unpickle_network(path: str | Path, *, trust: bool = False) -> Any:
 
 
 def simbench_pack() -> tuple[np.ndarray, np.ndarray]:
-    """[35136, 8] solar and [35136, 18] load profiles of 2016 in 15-minute steps, each with a maximum of 1 (ODbL 1.0)."""
+    """[35136, 8] solar and [35136, 18] load profiles of 2016 in 15-minute steps, maximum 1 each (ODbL 1.0)."""
     with lzma.open(DATA / "simbench_profiles.npy.xz") as file:
         pack = np.load(file).astype(np.float64) / 65535
     return pack[:, :SIMBENCH_PV], pack[:, SIMBENCH_PV:]

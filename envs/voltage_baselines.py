@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import power_flow
 from .base import State
 from .voltage_control import VoltageControl
 

@@ -18,6 +18,7 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,8 @@ class Scenario:
     Attributes:
       name: the network's name.
       network: for the power flow, injections allowed at load and PV buses.
-      table: load_bus [n_load], pv_bus [n_pv] in agent order, zone [n] (0 is nobody's), p0, q0 [n_load] nominal MW and MVAr,
-        s_max [n_pv] MVA (used only to scale generated profiles).
+      table: load_bus [n_load], pv_bus [n_pv] in agent order, zone [n] (0 is nobody's), p0, q0 [n_load] nominal MW and
+        MVAr, s_max [n_pv] MVA (used only to scale generated profiles).
       action_scale: of the largest reactive power, at action 1.
       barrier: the reward's default.
     """
@@ -82,7 +83,7 @@ class Carry:
       key: what noise is drawn from.
       row: [n_pv + 2 n_load] MW and MVAr of PVs, active and reactive loads that the next power flow uses.
       q: [n_pv] MVAr now set at the inverters.
-      p_bus, q_bus: [n] MW and MVAr consumed at each bus in the last solved flow; the slack's is minus the grid's import.
+      p_bus, q_bus: [n] MW and MVAr consumed at each bus in the last solved flow; the slack's is minus the import.
       vm_pu, va_rad: [n] its voltages.
       line_loss_mw: [] its losses in lines.
       frames: [h, N, F] the last observations, oldest first, or None where history is 1.
@@ -106,8 +107,8 @@ class VoltageControl:
 
     Args:
       case: "case33", "case141", or a Scenario of your own.
-      data: "simbench" (measured profiles in the package), "synthetic" or "synthetic:SEED", a folder with MAPDN's three csv
-        files, an npz of `grid_data.save_profiles`, or Profiles.
+      data: "simbench" (measured profiles in the package), "synthetic" or "synthetic:SEED", a folder with MAPDN's three
+        csv files, an npz of `grid_data.save_profiles`, or Profiles.
       noise: add MAPDN's one-sided noise to every data row.
       barrier: what voltages cost in the reward: l1, l2, bowl, courant_beltrami or bump; the scenario's own where None.
       reward: `mapdn`, or `loss_only` which leaves voltages to the cost.
@@ -209,7 +210,7 @@ class VoltageControl:
     # The four functions of the contract
 
     def reset(self, key: jax.Array) -> State:
-        """A random date at a random interval, reactive powers drawn uniformly; another one where that has no solution."""
+        """A random date at a random interval, reactive powers uniform; another one if that has no solution."""
 
         def draw(attempt: jax.Array) -> Carry:
             hour_key, day_key, q_key, carry_key = jax.random.split(jax.random.fold_in(key, attempt), 4)
@@ -229,7 +230,7 @@ class VoltageControl:
         return self._observe(carry)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """3 minutes with reactive powers `action` [N, 1], of which 1 is the scenario's share of what a PV has to spare."""
+        """3 minutes with reactive powers `action` [N, 1], 1 being the scenario's share of what a PV has to spare."""
         carry: Carry = state.carry
         q = self._reactive(carry.row, action)
         flow, p_bus, q_bus = self._solve(carry.row, q)
@@ -436,11 +437,11 @@ def barrier(kind: str, vm_pu: jax.Array) -> jax.Array:
     """MAPDN's voltage barriers, elementwise on voltages in p.u.; their limits are part of their definition."""
     off = jnp.abs(vm_pu - 1)
     if kind == "l1":
-        return off
+        return jnp.asarray(off)
     if kind == "l2":
         return 2 * off**2
     if kind == "bowl":
-        normal = jnp.exp(-0.5 * (off / 0.1) ** 2) / (0.1 * np.sqrt(2 * np.pi))
+        normal = jnp.exp(-0.5 * (off / 0.1) ** 2) / (0.1 * math.sqrt(2 * math.pi))
         return jnp.where(off > 0.05, 2 * off - 0.095, 0.04 - 0.01 * normal)
     if kind == "courant_beltrami":
         return jnp.maximum(vm_pu - 1.05, 0) ** 2 + jnp.maximum(0.95 - vm_pu, 0) ** 2
@@ -472,7 +473,7 @@ def _at_least(name: str, value: int, least: int) -> int:
 
 
 def _views(n: int, pv_bus: np.ndarray, zone: np.ndarray, blocks: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, F] and [S] indices into the pool p(n) q(n) pv(n_pv) q_pv(n_pv) vm(n) va(n), for agents followed by one zero."""
+    """[N, F] and [S] indices into the pool p(n) q(n) pv(n_pv) q_pv(n_pv) vm(n) va(n), for agents and one zero."""
     n_pv = len(pv_bus)
     bus, plant = np.arange(n), np.arange(n_pv)
     pool = {
