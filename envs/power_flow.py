@@ -16,6 +16,7 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +31,8 @@ DATA = Path(__file__).parent / "data"
 NETWORKS = ("case33", "case141")
 MAX_ITERATIONS = 60  # at 0.999 of the voltage collapse 22 are needed, beyond it no number is enough
 TOLERANCE = {"float32": 5e-7, "float64": 1e-11}  # p.u., largest change of a voltage in the last iteration
+FIRST_ITERATIONS = 6  # written out without a test: hardly any state can do without them, and a loop has its costs
+LANES = 64  # states that are solved together on a CPU
 EASY_ITERATIONS = 8  # in f32, states that needed more are so close to collapse that rounding must be corrected
 
 
@@ -144,14 +147,10 @@ def _voltage_deviation(
     net: Network, power: jax.Array, tolerance: float, max_iterations: int
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
     """The fixed point x [2m] of x = Z conj(S / (V_0 + x)), the iterations it took and its residual."""
+    find_one = _finder(tolerance, max_iterations)
 
-    def image(x: jax.Array) -> jax.Array:
-        return _dot(_current(net.no_load + x, power), net.impedance)
-
-    def find(_: Any, start: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        x, iterations, residual = _anderson(image, start, tolerance, max_iterations)
-        if x.dtype == jnp.float32:
-            x = _polish(net, power, x, iterations > EASY_ITERATIONS, tolerance)
+    def find(_: Any, __: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        x, iterations, residual = find_one(net.no_load, net.impedance, power)
         # as a float, because custom_root asks for tangents of all that it returns
         return x, (iterations.astype(x.dtype), residual)
 
@@ -163,44 +162,122 @@ def _voltage_deviation(
     def solve_linear(linear: Callable[[jax.Array], jax.Array], rhs: jax.Array) -> jax.Array:
         return jax.lax.custom_linear_solve(linear, rhs, iterate, iterate)
 
-    start = jnp.zeros_like(power)
-    return jax.lax.custom_root(lambda x: image(x) - x, start, find, solve_linear, has_aux=True)
+    def error(x: jax.Array) -> jax.Array:
+        return _dot(_current(net.no_load + x, power), net.impedance) - x
+
+    return jax.lax.custom_root(error, jnp.zeros_like(power), find, solve_linear, has_aux=True)
+
+
+@functools.cache
+def _finder(tolerance: float, max_iterations: int) -> Callable[..., tuple[jax.Array, jax.Array, jax.Array]]:
+    """(no_load [2m], impedance [2m, 2m], power [2m]) -> x [2m], iterations [], residual [], with a vmap of its own.
+
+    A batch is solved LANES states at a time, each group until its last one has arrived: on a CPU the vectors of a group
+    then stay in the cache, which is worth a factor of two, and no state waits for the hardest of the whole batch.
+    """
+
+    def find_group(no_load: jax.Array, impedance: jax.Array, power: jax.Array) -> tuple[jax.Array, ...]:
+        """The same for power [..., 2m]."""
+
+        def image(x: jax.Array) -> jax.Array:
+            return _dot(_current(no_load + x, power), impedance)
+
+        x, iterations, residual = _anderson(image, jnp.zeros_like(power), tolerance, max_iterations, FIRST_ITERATIONS)
+        if x.dtype == jnp.float32:
+            hard = iterations > EASY_ITERATIONS
+
+            def correct(c: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+                # The barrier ties everything to the loop, or XLA would prepare the correction outside of it, for all.
+                old, *given = jax.lax.optimization_barrier((c[0], no_load, impedance, power))
+                better = _polish(given[0], given[1], given[2], old, tolerance)
+                return jnp.where(c[1][..., None], better, old), jnp.zeros_like(c[1])
+
+            # A loop of one turn or none: skipping it is cheaper than a `cond`, which copies what its branches read.
+            x = jax.lax.while_loop(lambda c: jnp.any(c[1]), correct, (x, hard))[0]
+        return x, iterations, residual
+
+    @jax.custom_batching.custom_vmap
+    def find_many(no_load: jax.Array, impedance: jax.Array, power: jax.Array) -> tuple[jax.Array, ...]:
+        """The same for power [B, 2m], B any."""
+        size = power.shape[0]
+        if size <= LANES or jax.default_backend() != "cpu":
+            return find_group(no_load, impedance, power)
+        groups = -(-size // LANES)
+        padded = jnp.pad(power, ((0, groups * LANES - size), (0, 0))).reshape(groups, LANES, -1)
+        found = jax.lax.map(lambda group: find_group(no_load, impedance, group), padded)
+        return tuple(x.reshape(groups * LANES, *x.shape[2:])[:size] for x in found)
+
+    @jax.custom_batching.custom_vmap
+    def find_one(no_load: jax.Array, impedance: jax.Array, power: jax.Array) -> tuple[jax.Array, ...]:
+        return find_group(no_load, impedance, power)
+
+    @find_one.def_vmap
+    def _(size: int, batched: list[bool], *args: jax.Array) -> tuple[Any, Any]:
+        if batched[0] or batched[1]:  # as many networks as states
+            return jax.vmap(find_group, [0 if b else None for b in batched])(*args), (True,) * 3
+        return find_many(*args), (True,) * 3
+
+    @find_many.def_vmap
+    def _(size: int, batched: list[bool], *args: jax.Array) -> tuple[Any, Any]:
+        if batched[0] or batched[1]:
+            return jax.vmap(find_group, [0 if b else None for b in batched])(*args), (True,) * 3
+        no_load, impedance, power = args
+        found = find_many(no_load, impedance, power.reshape(-1, power.shape[-1]))
+        return tuple(x.reshape(size, -1, *x.shape[1:]) for x in found), (True,) * 3
+
+    return find_one
 
 
 def _anderson(
-    image: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: Any, max_iterations: int
+    image: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: Any, max_iterations: int, unroll: int = 0
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Fixed point of `image` from `start` [k] by Anderson acceleration of depth 2 (Walker & Ni, 2011).
+    """Fixed points of `image` from `start` [..., k] by Anderson acceleration of depth 2 (Walker & Ni, 2011).
 
     x' = g - y_1 dg_1 - y_2 dg_2, where g = image(x), f = g - x, dg_j and df_j are their last two differences, and y
-    minimises |f - y_1 df_1 - y_2 df_2|.
+    minimises |f - y_1 df_1 - y_2 df_2|. Each vector stops by itself, whatever the others do, but not
+    before iteration `unroll`.
 
     Returns:
-      The last x, the number of iterations, and max|f| at the x before.
+      The last x, the number of iterations [...], and max|f| [...] at the x before.
     """
 
-    def unfinished(c: tuple[jax.Array, ...]) -> jax.Array:
-        return (c[-1] > tolerance) & (c[-2] < max_iterations)
-
-    def iterate(c: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        x, last_g, last_f, dg_2, df_2, k, _ = c
+    def advance(history: tuple[jax.Array, ...], k: int | jax.Array) -> tuple[tuple[jax.Array, ...], jax.Array]:
+        x, last_g, last_f, dg_2, df_2 = history
         g = image(x)
         f = g - x
         dg_1, df_1 = g - last_g, f - last_f
-        y_1, y_2 = _least_squares(df_1, df_2, f, k)
-        return g - y_1 * dg_1 - y_2 * dg_2, g, f, dg_1, df_1, k + 1, jnp.max(jnp.abs(f))
+        after = g
+        if not (isinstance(k, int) and k == 0):
+            y_1, y_2 = _least_squares(df_1, df_2, f, k)
+            after = g - y_1[..., None] * dg_1 - y_2[..., None] * dg_2
+        return (after, g, f, dg_1, df_1), jnp.max(jnp.abs(f), axis=-1)
 
-    zero = jnp.zeros_like(start)
-    infinite = jnp.full((), jnp.inf, start.dtype)
-    x, *_, iterations, residual = jax.lax.while_loop(
-        unfinished, iterate, (start, zero, zero, zero, zero, jnp.zeros((), jnp.int32), infinite)
-    )
+    def unfinished(c: tuple[Any, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, _, k, residual = c
+        return jnp.any(residual > tolerance) & (k < max_iterations)
+
+    def iterate(c: tuple[Any, jax.Array, jax.Array, jax.Array]) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
+        history, count, k, residual = c
+        going = residual > tolerance
+        (x, *rest), now = advance(history, k)
+        if start.ndim > 1:
+            x, now = jnp.where(going[..., None], x, history[0]), jnp.where(going, now, residual)
+        return (x, *rest), count + going, k + 1, now
+
+    history, residual = (start, *(jnp.zeros_like(start),) * 4), jnp.full_like(start[..., 0], jnp.inf)
+    first = min(unroll, max_iterations)
+    for k in range(first):
+        history, residual = advance(history, k)
+    count = jnp.full(residual.shape, first, jnp.int32)
+    c = (history, count, jnp.asarray(first, jnp.int32), residual)
+    (x, *_), iterations, _, residual = jax.lax.while_loop(unfinished, iterate, c)
     return x, iterations, residual
 
 
-def _least_squares(a: jax.Array, b: jax.Array, f: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """y of min |f - y_1 a - y_2 b| in iteration k, where k < 2 has fewer columns; 0 where it is not determined."""
-    aa, ab, bb, af, bf = a @ a, a @ b, b @ b, a @ f, b @ f
+def _least_squares(a: jax.Array, b: jax.Array, f: jax.Array, k: int | jax.Array) -> tuple[jax.Array, jax.Array]:
+    """y [...] of min |f - y_1 a - y_2 b| in iteration k, where k < 2 has fewer columns; 0 if undetermined."""
+    inner = jnp.dot if f.ndim == 1 else lambda v, w: jnp.sum(v * w, axis=-1)  # each is the faster on a CPU
+    aa, ab, bb, af, bf = inner(a, a), inner(a, b), inner(b, b), inner(a, f), inner(b, f)
     det = aa * bb - ab * ab
     both = (k >= 2) & (det > 1e-6 * aa * bb)
     one = (k >= 1) & (aa > 0)
@@ -209,48 +286,37 @@ def _least_squares(a: jax.Array, b: jax.Array, f: jax.Array, k: jax.Array) -> tu
     return jnp.where(both, (bb * af - ab * bf) / det, alone), jnp.where(both, (aa * bf - ab * af) / det, 0)
 
 
-def _polish(net: Network, power: jax.Array, x: jax.Array, wanted: jax.Array, tolerance: float) -> jax.Array:
-    """`x` corrected for rounding where `wanted`; near collapse f32 rounding is amplified thirtyfold.
+def _polish(no_load: jax.Array, impedance: jax.Array, power: jax.Array, x: jax.Array, tolerance: float) -> jax.Array:
+    """`x` [..., 2m] corrected for rounding; near collapse f32 rounding is amplified thirtyfold.
 
     The correction d solves d = r + G(x + d) - G(x) with r = G(x) - x the residual, its currents to twice the precision;
-    the difference of currents is formed without cancellation. A loop, because under vmap it is skipped as long as
-    no state of the batch wants it, while both sides of a `cond` would run.
+    the difference of currents is formed without cancellation.
     """
-    m = power.shape[0] // 2
-    s = jax.lax.complex(power[:m], power[m:])
+    p, q = jnp.split(power, 2, axis=-1)
+    s = jax.lax.complex(p, q)
+    current = _current(no_load + x, power)
+    residual = _voltage_error(current, _current_error(no_load, power, x, current), impedance, x)
+    v = jax.lax.complex(*jnp.split(no_load + x, 2, axis=-1))
 
-    def correct(c: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        x, _ = c
-        voltage = net.no_load + x
-        current = _current(voltage, power)
-        missing = _current_error(net, power, x, current)
-        residual = _voltage_error(current, missing, net.impedance, x)
-        v = jax.lax.complex(voltage[:m], voltage[m:])
+    def image(d: jax.Array) -> jax.Array:
+        d_complex = jax.lax.complex(*jnp.split(d, 2, axis=-1))
+        change = -jnp.conj(s * d_complex / (v * (v + d_complex)))
+        return residual + _dot(jnp.concatenate([change.real, change.imag], axis=-1), impedance)
 
-        def image(d: jax.Array) -> jax.Array:
-            d_complex = jax.lax.complex(d[:m], d[m:])
-            change = -jnp.conj(s * d_complex / (v * (v + d_complex)))
-            return residual + _dot(jnp.concatenate([change.real, change.imag]), net.impedance)
-
-        d, _, _ = _anderson(image, residual, tolerance / 1000, MAX_ITERATIONS)
-        return x + d, jnp.zeros((), bool)
-
-    return jax.lax.while_loop(lambda c: c[1], correct, (x, wanted))[0]
+    return x + _anderson(image, residual, tolerance / 1000, MAX_ITERATIONS)[0]
 
 
 def _current(voltage: jax.Array, power: jax.Array) -> jax.Array:
-    """conj(S / V) [2m] = conj(S) V / |V|^2 of `power` and `voltage` [2m]."""
-    m = power.shape[0] // 2
-    e, f, p, q = voltage[:m], voltage[m:], power[:m], power[m:]
+    """conj(S / V) [..., 2m] = conj(S) V / |V|^2 of `power` and `voltage` [..., 2m]."""
+    (e, f), (p, q) = jnp.split(voltage, 2, axis=-1), jnp.split(power, 2, axis=-1)
     inverse = 1 / (e * e + f * f)
-    return jnp.concatenate([(p * e + q * f) * inverse, (p * f - q * e) * inverse])
+    return jnp.concatenate([(p * e + q * f) * inverse, (p * f - q * e) * inverse], axis=-1)
 
 
-def _current_error(net: Network, power: jax.Array, x: jax.Array, current: jax.Array) -> jax.Array:
-    """What `current` [2m] lacks: (conj(S) - I conj(V)) / conj(V), the numerator from exact products and sums."""
-    m = power.shape[0] // 2
-    i_re, i_im, x_re, x_im = current[:m], current[m:], x[:m], x[m:]
-    base_re, base_im = net.no_load[:m], net.no_load[m:]
+def _current_error(no_load: jax.Array, power: jax.Array, x: jax.Array, current: jax.Array) -> jax.Array:
+    """What `current` [..., 2m] lacks: (conj(S) - I conj(V)) / conj(V), the numerator from exact products and sums."""
+    (i_re, i_im), (x_re, x_im) = jnp.split(current, 2, axis=-1), jnp.split(x, 2, axis=-1)
+    (p, q), (base_re, base_im) = jnp.split(power, 2, axis=-1), jnp.split(no_load, 2, axis=-1)
 
     def times(a: jax.Array, b: jax.Array, sign: int = -1) -> list[jax.Array]:
         (a_high, a_low), (b_high, b_low) = _split(a), _split(b)
@@ -259,19 +325,19 @@ def _current_error(net: Network, power: jax.Array, x: jax.Array, current: jax.Ar
     def twice(a: jax.Array, b_1: jax.Array, b_2: jax.Array, sign: int = -1) -> list[jax.Array]:
         return times(a, b_1, sign) + times(a, b_2, sign)
 
-    e_re = _sum([power[:m], *twice(i_re, base_re, x_re), *twice(i_im, base_im, x_im)])
-    e_im = _sum([-power[m:], *twice(i_im, base_re, x_re), *twice(i_re, base_im, x_im, 1)])
-    return _current(jnp.concatenate([base_re + x_re, base_im + x_im]), jnp.concatenate([e_re, -e_im]))
+    e_re = _sum([p, *twice(i_re, base_re, x_re), *twice(i_im, base_im, x_im)])
+    e_im = _sum([-q, *twice(i_im, base_re, x_re), *twice(i_re, base_im, x_im, 1)])
+    return _current(no_load + x, jnp.concatenate([e_re, -e_im], axis=-1))
 
 
 def _voltage_error(current: jax.Array, missing: jax.Array, impedance: jax.Array, x: jax.Array) -> jax.Array:
-    """(current + missing) @ impedance - x [2m], where rounding in the product's sums would be as large as the result.
+    """(current + missing) @ impedance - x [..., 2m], where rounding in the product's sums would be as large as that.
 
     Matrix and vector are cut into leading bits and rest; the product of the leading bits, 7 and 8 below the largest
     entry, is exact in f32 for up to 2^9 terms in any order of summation, and cancels against x before the rest comes.
     """
     top, rest = _leading_bits(impedance, jnp.max(jnp.abs(impedance), axis=0), 7)
-    head, tail = _leading_bits(current, jnp.max(jnp.abs(current)), 8)
+    head, tail = _leading_bits(current, jnp.max(jnp.abs(current), axis=-1, keepdims=True), 8)
     return (_dot(head, top) - x) + (_dot(tail, top) + _dot(current, rest) + _dot(missing, impedance))
 
 
