@@ -149,7 +149,7 @@ def _voltage_deviation(
     """The fixed point x [2m] of x = Z conj(S / (V_0 + x)), the iterations it took and its residual."""
     find_one = _finder(tolerance, max_iterations)
 
-    def find(_: Any, __: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    def find(_: Any, __: Any) -> Any:
         x, iterations, residual = find_one(net.no_load, net.impedance, power)
         # as a float, because custom_root asks for tangents of all that it returns
         return x, (iterations.astype(x.dtype), residual)
@@ -165,7 +165,7 @@ def _voltage_deviation(
     def error(x: jax.Array) -> jax.Array:
         return _dot(_current(net.no_load + x, power), net.impedance) - x
 
-    return jax.lax.custom_root(error, jnp.zeros_like(power), find, solve_linear, has_aux=True)
+    return jax.lax.custom_root(error, jnp.zeros_like(power), find, solve_linear, has_aux=True)  # type: ignore[return-value] (its stubs know no aux)
 
 
 @functools.cache
@@ -187,13 +187,11 @@ def _finder(tolerance: float, max_iterations: int) -> Callable[..., tuple[jax.Ar
             hard = iterations > EASY_ITERATIONS
 
             def correct(c: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-                # The barrier ties everything to the loop, or XLA would prepare the correction outside of it, for all.
-                old, *given = jax.lax.optimization_barrier((c[0], no_load, impedance, power))
-                better = _polish(given[0], given[1], given[2], old, tolerance)
-                return jnp.where(c[1][..., None], better, old), jnp.zeros_like(c[1])
+                better = _polish(no_load, impedance, power, c[0], tolerance)
+                return jnp.where(c[1][..., None], better, c[0]), jnp.zeros_like(c[1])
 
-            # A loop of one turn or none: skipping it is cheaper than a `cond`, which copies what its branches read.
-            x = jax.lax.while_loop(lambda c: jnp.any(c[1]), correct, (x, hard))[0]
+            # A loop of one turn, or of none while no state of the group is hard.
+            x, _ = jax.lax.while_loop(lambda c: jnp.any(c[1]), correct, (x, hard))
         return x, iterations, residual
 
     @jax.custom_batching.custom_vmap
