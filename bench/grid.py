@@ -208,7 +208,7 @@ def power_flow_table(case: str, rounds: int, seconds: float) -> dict:
         "lightsim2grid, solve only": lightsim_runs(case, p[0], q[0], False),
         "pandapower": pandapower_runs(case, p[0], q[0]),
     }
-    reference = batch["ours f64"][1]()
+    reference = np.asarray(batch["ours f64"][1]())
     errors = {}
     for size, contestants in (("1024", batch), ("1", single)):
         for name, (run, voltages) in contestants.items():

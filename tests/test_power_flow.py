@@ -61,8 +61,7 @@ def mismatch(case: str, vm: np.ndarray, va: np.ndarray) -> np.ndarray:
     return np.abs(power - (p + 1j * q))[:, child].max(axis=1)
 
 
-@pytest.mark.parametrize("restricted", [False, True])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(("dtype", "restricted"), [("float32", False), ("float32", True), ("float64", False)])
 @pytest.mark.parametrize("case", CASES)
 def test_convergence_is_told_apart_from_collapse(case: str, dtype: str, restricted: bool) -> None:
     flow, data = solved(case, dtype, restricted), recorded(case)
