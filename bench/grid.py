@@ -122,7 +122,7 @@ def lightsim_runs(case: str, p: np.ndarray, q: np.ndarray, set_power: bool) -> t
             model.update_loads_q(changed, q_load)
         return model.ac_pf(flat, 10, 1e-8)
 
-    return run, lambda: np.abs(run())
+    return run, lambda: np.abs(np.asarray(run()))
 
 
 def pgm_runs(case: str, p: np.ndarray, q: np.ndarray, method: str, threads: int) -> tuple[Run, Callable[[], Any]]:
