@@ -29,7 +29,7 @@ import numpy as np
 from . import power_flow
 from .base import EnvSpec, State
 from .errors import TaskError, one_of
-from .grid_data import MINUTES, ROWS_PER_DAY, Profiles, load_profiles
+from .grid_data import ROWS_PER_DAY, Profiles, load_profiles
 from .power_flow import Network, PowerFlow
 
 EPISODE_LIMIT = 240  # MAPDN's intervals of 3 minutes; with its timing one less is a control step
@@ -451,13 +451,6 @@ def barrier(kind: str, vm_pu: jax.Array) -> jax.Array:
         inside = (size != 1) & (size < 3)
         return jnp.where(inside, jnp.exp(-1 / jnp.where(inside, 1 - fourth, 1)), 0)
     raise TaskError(f"unknown barrier '{kind}'")
-
-
-def clock(env: VoltageControl, start_row: int) -> str:
-    """The time of day of a data row, for pictures and logs."""
-    del env
-    minutes = start_row * MINUTES % (24 * 60)
-    return f"{minutes // 60:02d}:{minutes % 60:02d}"
 
 
 def _blocks(state_space: str | tuple[str, ...]) -> tuple[str, ...]:

@@ -142,6 +142,18 @@ def test_gradients_agree_with_finite_differences() -> None:
         np.testing.assert_allclose(tangent, gradient[17], rtol=1e-8)
 
 
+def test_batches_of_batches_and_of_gradients() -> None:
+    """More states than one group holds, below two vmaps, and gradients below one."""
+    network = power_flow.load_network("case33")
+    p, q = (jnp.asarray(x[:150], jnp.float32) for x in injections("case33"))
+    nested = jax.vmap(jax.vmap(lambda p, q: power_flow.solve(network, p, q).vm_pu))
+    voltages = jax.jit(nested)(p.reshape(2, 75, 33), q.reshape(2, 75, 33)).reshape(150, 33)
+    np.testing.assert_allclose(voltages, solved("case33", "float32").vm_pu[:150], atol=5e-7)
+    gradient = jax.grad(lambda q, p: power_flow.solve(network, p, q).line_loss_mw)
+    batch = jax.jit(jax.vmap(gradient))(q[:3], p[:3])
+    np.testing.assert_allclose(batch[1], gradient(q[1], p[1]), atol=1e-5)
+
+
 def test_two_buses_have_a_closed_form() -> None:
     """|V|^4 + |V|^2 (2 (r p + x q) - 1) + |z|^2 |s|^2 = 0 for consumption p + jq behind r + jx; it ends at the nose."""
     r, x, p, q = 0.1, 0.2, 0.6, 0.3
