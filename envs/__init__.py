@@ -23,6 +23,8 @@ _TASKS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "lane": ("toys", "Lane", {}),
     "switch": ("toys", "Switch", {}),
     "noisy": ("toys", "Noisy", {}),
+    "voltage_33": ("voltage_control", "VoltageControl", {"case": "case33"}),
+    "voltage_141": ("voltage_control", "VoltageControl", {"case": "case141"}),
 }
 
 
