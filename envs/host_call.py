@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import sys
+import math
+import threading
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +28,7 @@ _ABI = (0, 3)
 _EXECUTE = 3
 _METADATA = 1
 _INTERNAL = 13
-_DTYPES = {3: np.int16, 4: np.int32, 5: np.int64, 11: np.float32, 12: np.float64}
+_DTYPES = {code: np.dtype(name) for code, name in ((4, "int32"), (5, "int64"), (11, "float32"), (12, "float64"))}
 
 
 def _struct(name: str, *fields: tuple[str, type]) -> type[ctypes.Structure]:
@@ -70,10 +71,16 @@ class _Extension(ctypes.Structure):
 
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
+_Porch = ctypes.PYFUNCTYPE(None, ctypes.POINTER(_Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Error))
 
 _names = itertools.count()
 _alive: list[Any] = []  # XLA keeps the addresses for the life of the process
+_arrived: set[int] = set()  # threads that got from XLA into Python
+
+
+class GivenUp(RuntimeError):
+    """Raised by a host function to end the program on purpose: its message becomes the error, without a traceback."""
 
 
 def register(function: HostFunction) -> str:
@@ -81,22 +88,27 @@ def register(function: HostFunction) -> str:
 
     Names count up in the order of registration, so a program compiled in one process is found in the cache by the next
     that registers in the same order. `function` runs on XLA's thread with the interpreter lock held, must fill its
-    result and must not call JAX; what it raises becomes the program's error.
+    result and must not call JAX; what it raises becomes the program's error, and its traceback goes to stderr.
     """
 
-    def handle(frame_pointer: ctypes._Pointer) -> int | None:
-        frame = frame_pointer.contents
+    def handle(_: None, __: Any, arguments: tuple[Any, ...]) -> int | None:
         try:
-            if frame.extension and _describe(frame.extension):
-                return None
-            if frame.stage == _EXECUTE:
+            if threading.get_ident() not in _arrived:
+                raise GivenUp("interrupted (Ctrl-C)")
+            _arrived.discard(threading.get_ident())
+            frame = arguments[0].contents
+            if not (frame.extension and _describe(frame.extension)) and frame.stage == _EXECUTE:
                 function(_array(frame.operands), _array(frame.results))
-        except Exception as error:
-            traceback.print_exc(file=sys.stderr)
-            return _error(frame.api, f"{type(error).__name__}: {error}")
-        return None
+            return None
+        except BaseException as error:
+            return _error(arguments[0].contents.api, error)
 
-    handler = _Handler(handle)
+    # What escapes from a callback is printed by ctypes, and XLA takes whatever lies on the stack for our answer. A
+    # `try` is no help against Ctrl-C, which strikes at the first bytecode after XLA's own work, before any `try`. So
+    # the first Python to run is a porch from which nothing needs to come back; `handle` then asks who arrived.
+    porch = _Porch(lambda _: _arrived.add(threading.get_ident()))
+    porch.errcheck = handle  # pyright: ignore[reportAttributeAccessIssue]
+    handler = _Handler(porch)
     name = f"pmt_host_call_{next(_names)}"
     _alive.append(handler)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
@@ -124,13 +136,17 @@ def _array(buffers: ctypes.Structure) -> np.ndarray:
     """The first of XLA's buffers as an array that shares its memory."""
     address = ctypes.c_void_p.from_address(buffers.items).value  # pyright: ignore[reportAttributeAccessIssue]
     buffer = _Buffer.from_address(address)  # pyright: ignore[reportArgumentType]
-    shape, dtype = buffer.dims[: buffer.rank], np.dtype(_DTYPES[buffer.dtype])
-    size = int(np.prod(shape)) * dtype.itemsize
+    shape, dtype = tuple(buffer.dims[: buffer.rank]), _DTYPES[buffer.dtype]
+    size = math.prod(shape) * dtype.itemsize
     if size == 0:
         return np.empty(shape, dtype)
     return np.frombuffer(memoryview((ctypes.c_char * size).from_address(buffer.data)), dtype).reshape(shape)
 
 
-def _error(api_address: int, message: str) -> int | None:
-    arguments = _Error(ctypes.sizeof(_Error), None, message.encode(), _INTERNAL)
+def _error(api_address: int, error: BaseException) -> int | None:
+    """Makes XLA's error of ours; XLA takes it over."""
+    if isinstance(error, Exception) and not isinstance(error, GivenUp):
+        traceback.print_exception(error)
+    message = f"{type(error).__name__}: {error}".encode(errors="replace")
+    arguments = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
     return _CreateError(_Api.from_address(api_address).create_error)(ctypes.byref(arguments))

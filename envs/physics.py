@@ -1,10 +1,10 @@
 """One physics contract, three engines behind it.
 
-| engine   | where         | what it is                                                                        |
-|----------|---------------|-----------------------------------------------------------------------------------|
-| `mujoco` | CPU           | MuJoCo's C engine on a thread pool, called by XLA once per control step        |
-| `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes                      |
-| `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                                           |
+| engine   | where         | what it is                                                          |
+|----------|---------------|---------------------------------------------------------------------|
+| `mujoco` | CPU           | MuJoCo's C engine on a team of threads, called by XLA once per step |
+| `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
+| `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                             |
 
 Signatures are those of one environment; batches come from `jax.vmap`, nested as one likes.
 
@@ -36,8 +36,8 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Collection, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Iterator, Mapping
+from queue import SimpleQueue
 from typing import Any, Protocol
 
 import jax
@@ -45,7 +45,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import TaskError, one_of
-from .host_call import host_call, register
+from .host_call import GivenUp, host_call, register
 
 ENGINES = ("mjx", "mujoco", "warp")
 SOLVERS = ("converged", "fast")
@@ -220,7 +220,7 @@ def _start(model: mujoco.MjModel) -> PhysicsState:
 
 
 class CEngine:
-    """MuJoCo's C engine on a thread pool, called from inside the jitted program once per control step.
+    """MuJoCo's C engine on a team of threads, called from inside the jitted program once per control step.
 
     The numbers depend on neither the number of threads nor which of them advances which environment.
     """
@@ -233,6 +233,8 @@ class CEngine:
         _prepare_process()
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if model.ntree == 1:  # one tree is one island; the search for it takes 6 % of a step and changes no bit
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self._model, self._substeps, self._readout = model, substeps, dict(readout)
         self._threads = threads or usable_cpus()
         first = _Worker(model, substeps, readout)
@@ -252,34 +254,26 @@ class CEngine:
     def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
         """The host's side: qpos, qvel, warm start and ctrl [..., D] to what `_Worker` writes [..., E]."""
         if _leaving.is_set():
-            raise RuntimeError("the interpreter is shutting down; the program that ran is given up")
+            raise GivenUp("the interpreter is shutting down")
         _running.append(None)
         try:
             self._advance_rows(argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width))
         except KeyboardInterrupt:  # XLA runs short programs on the main thread; this cannot unwind through C
-            raise RuntimeError("interrupted in a physics step (Ctrl-C)") from None
+            raise GivenUp("interrupted in a physics step (Ctrl-C)") from None
         finally:
             _running.pop()
 
     def _advance_rows(self, rows: np.ndarray, out: np.ndarray) -> None:
-        sound = np.isfinite(rows).all(axis=1)
-        out[~sound] = np.nan  # broken before the step
+        todo: Collection[int] = range(len(rows))
+        if not np.isfinite(rows).all():
+            sound = np.isfinite(rows).all(axis=1)
+            out[~sound] = np.nan  # broken before the step
+            todo = np.flatnonzero(sound).tolist()
         # The threads draw rows from one iterator (atomic in CPython), so a slow thread delays nobody.
-        queue = iter(np.flatnonzero(sound).tolist())
-        helpers = []
-        for _ in range(min(self._threads, int(sound.sum())) - 1):
-            try:
-                helpers.append(_pool(self._threads).submit(self._work, queue, rows, out))
-            except RuntimeError:  # the interpreter is going down and takes no new work: this thread does it all
-                break
-        try:
-            self._work(queue, rows, out)
-        finally:
-            _settle(queue, helpers)
-        for helper in helpers:
-            helper.result()
+        queue, states = iter(todo), rows.astype(np.float64)
+        _team.share(lambda: self._work(queue, states, out), queue, min(self._threads, len(todo)))
 
-    def _work(self, queue: Iterator[int], rows: np.ndarray, out: np.ndarray) -> None:
+    def _work(self, queue: Iterator[int], states: np.ndarray, out: np.ndarray) -> None:
         try:
             worker = self._idle.pop()
         except IndexError:
@@ -287,11 +281,19 @@ class CEngine:
         _thread.quiet = True
         try:
             for row in queue:
-                worker.advance(rows[row], out[row])
+                worker.advance(states[row], out[row])
             worker.check_memory()
         finally:
             _thread.quiet = False
         self._idle.append(worker)
+
+
+_PACKED = int(
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_QVEL
+    | mujoco.mjtState.mjSTATE_WARMSTART
+    | mujoco.mjtState.mjSTATE_CTRL
+)  # what a control step starts from, in the order in which MuJoCo packs it
 
 
 class _Worker:
@@ -304,24 +306,25 @@ class _Worker:
         self._warnings = data.warning
         for warning in data.warning:
             warning.number = 1  # C reports the first of each kind only
-        self._inputs = _places([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl])
-        outputs = [data.qpos, data.qvel, data.qacc_warmstart]
-        outputs += [getattr(data, field)[index] for field, index in readout.values()]
-        self._outputs = _places([view.reshape(-1) for view in outputs])
-        self.parts = [(place, view.shape) for view, (_, place) in zip(outputs, self._outputs, strict=True)]
-        self.width = self._outputs[-1][1].stop
+        self._outputs = [data.qpos, data.qvel, data.qacc_warmstart]
+        readouts = [getattr(data, field)[index] for field, index in readout.values()]
+        self._outputs += [view.reshape(-1) for view in readouts]
+        ends = np.cumsum([view.size for view in self._outputs]).tolist()
+        shapes = [view.shape for view in (*self._outputs[:3], *readouts)]
+        self.parts = [
+            (slice(end - view.size, end), shape) for view, end, shape in zip(self._outputs, ends, shapes, strict=True)
+        ]
+        self.width = ends[-1]
 
-    def advance(self, row: np.ndarray, out: np.ndarray) -> None:
-        """One control step of one environment: `row` [D] to `out` [E]."""
+    def advance(self, state: np.ndarray, out: np.ndarray) -> None:
+        """One control step of one environment: `state` [D] (float64) to `out` [E]."""
         data = self._data
-        for view, place in self._inputs:
-            view[:] = row[place]
         data.time = 0.0
+        mujoco.mj_setState(self._model, data, state, _PACKED)
         mujoco.mj_step(self._model, data, self._substeps)
         if self._post_constraint:
             mujoco.mj_rnePostConstraint(self._model, data)
-        for view, place in self._outputs:
-            out[place] = view
+        np.concatenate(self._outputs, out=out, casting="same_kind")
 
     def check_memory(self) -> None:
         """Contacts that found no room were dropped by C with a warning only."""
@@ -330,42 +333,91 @@ class _Worker:
             raise MemoryError("MuJoCo ran out of room for contacts; raise <size memory=.../> in the model")
 
 
-def _places(arrays: list[np.ndarray]) -> list[tuple[np.ndarray, slice]]:
-    """Each array with its place in their concatenation."""
-    ends = np.cumsum([a.size for a in arrays]).tolist()
-    return [(a, slice(end - a.size, end)) for a, end in zip(arrays, ends, strict=True)]
+class _Team:
+    """Threads that help whichever engine calls; they start when first needed and then wait for work.
+
+    `concurrent.futures` would do, but its hand-over costs 16 ants 3 % of their speed. The threads are daemons, so that
+    nobody waits for them at exit; `_leave` sees to it that they are idle by then.
+    """
+
+    def __init__(self) -> None:
+        self.disband()
+
+    def disband(self) -> None:
+        """Forgets the threads, which do not survive a fork; new ones start when needed."""
+        self._jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._size = 0
+
+    def share(self, work: Callable[[], None], queue: Iterator[Any], threads: int) -> None:
+        """Runs `work`, which takes from `queue` until it is empty, on this thread and on `threads - 1` others.
+
+        When this returns or raises, nobody works any more: a helper that comes late finds the queue empty.
+        """
+        inside: list[None] = []  # one entry for each helper at work
+        errors: list[BaseException] = []
+        left: SimpleQueue[None] = SimpleQueue()
+
+        def assist() -> None:
+            inside.append(None)
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+            finally:
+                inside.pop()
+                left.put(None)
+
+        def settle() -> None:
+            for _ in queue:  # only after a failure is anything left
+                pass
+            while inside:
+                left.get()
+
+        try:
+            for _ in range(min(threads - 1, self._recruit(threads - 1))):
+                self._jobs.put(assist)
+            work()
+        finally:
+            while True:
+                try:
+                    settle()
+                    break
+                except KeyboardInterrupt:  # again: it takes no more than one environment's control step
+                    continue
+        if errors:
+            raise errors[0]
+
+    def _recruit(self, size: int) -> int:
+        """Makes the team at least that large if it can, and returns how large it is."""
+        with contextlib.suppress(RuntimeError):  # the interpreter is going down and starts no new thread
+            while self._size < size:
+                threading.Thread(target=_serve, args=[self._jobs], name="pmt-physics", daemon=True).start()
+                self._size += 1
+        return self._size
 
 
-_pools: dict[int, ThreadPoolExecutor] = {}
+def _serve(jobs: SimpleQueue[Callable[[], None]]) -> None:
+    while True:
+        jobs.get()()
+
+
+_team = _Team()
 _running: list[None] = []  # one entry for each host call under way
 _leaving = threading.Event()
 _thread = threading.local()  # its `quiet` is True while the thread works for us
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """One pool for all engines with that many threads; the calling thread works too, hence one fewer."""
-    if threads not in _pools:
-        _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="pmt-physics")
-    return _pools[threads]
-
-
-def _settle(queue: Iterator[int], helpers: list[Future[None]]) -> None:
-    """Waits until no helper writes into XLA's buffers any more, whatever ended the calling thread's own work."""
-    while True:
-        try:
-            for _ in queue:  # only after a failure is anything left; the helpers then find nothing more to do
-                pass
-            wait(helpers)
-            return
-        except KeyboardInterrupt:  # again: it takes no more than one environment's control step
-            continue
+def _forked() -> None:
+    """Makes a child's process its own: neither threads nor host calls under way came with it."""
+    _team.disband()
+    _running.clear()
 
 
 @functools.cache
 def _prepare_process() -> None:
     """What makes threads safe to fork and to leave, and C quiet; done once, when the first engine is built."""
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork; the child starts its own
+        os.register_at_fork(after_in_child=_forked)
     atexit.register(_leave)
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_hear)

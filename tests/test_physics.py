@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from pathlib import Path
 
 import jax
@@ -113,6 +115,55 @@ def test_large_batches_in_long_programs_do_not_deadlock():
         return jax.lax.scan(lambda s, _: (step(s, ctrl)[0], None), state, None, length=3)[0]
 
     assert np.isfinite(jax.block_until_ready(roll(state)).qpos).all()
+
+
+def test_two_programs_at_once_share_the_threads():
+    state, ctrl = starts(24)
+    step = jax.jit(jax.vmap(engine(threads=3).step))
+    alone = step(state, ctrl)
+    results = []
+    threads = [threading.Thread(target=lambda: results.append(step(state, ctrl))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 4
+    for result in results:
+        assert_same(result, alone)
+
+
+def test_team_does_each_piece_once_and_leaves_nobody_behind():
+    team = physics._Team()
+    for threads in (1, 2, 5):
+        queue, taken, at_work = iter(range(50)), [], []
+
+        def work(queue=queue, taken=taken, at_work=at_work):
+            at_work.append(None)
+            for piece in queue:
+                time.sleep(1e-4)
+                taken.append(piece)
+            at_work.pop()
+
+        team.share(work, queue, threads)
+        assert sorted(taken) == list(range(50)) and not at_work
+
+
+@pytest.mark.parametrize("guilty", ["the caller", "a helper"])
+def test_team_passes_errors_on_and_stops(guilty):
+    team, queue, caller, taken = physics._Team(), iter(range(1000)), threading.get_ident(), []
+
+    def work():
+        for piece in queue:
+            time.sleep(1e-3)
+            taken.append(piece)
+            if (threading.get_ident() == caller) is (guilty == "the caller"):
+                raise ZeroDivisionError(guilty)
+
+    with pytest.raises(ZeroDivisionError, match=guilty):
+        team.share(work, queue, 2)
+    done = len(taken)
+    time.sleep(0.02)
+    assert len(taken) == done and next(queue, None) is None
 
 
 def test_double_precision_goes_through():
