@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pmt_jax import learner, load_config, setup
+from pmt_jax import evaluate, learner, load_config, setup
 from pmt_jax.run import Run
 
 Ranges = dict[str, tuple[float, float]]  # name -> (lowest, highest)
@@ -33,23 +33,32 @@ def draw(run: Run, draws: int, seed: int, ranges: Ranges) -> Any:
     """The run's settings with `draws` random values of those in `ranges`: leaves [draws]."""
     rng = np.random.default_rng(seed)
     hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), run.hyper)
-    drawn = {n: jnp.asarray(np.exp(rng.uniform(np.log(r[0]), np.log(r[1]), draws)), jnp.float32) for n, r in ranges.items()}
+    drawn = {
+        n: jnp.asarray(np.exp(rng.uniform(np.log(r[0]), np.log(r[1]), draws)), jnp.float32) for n, r in ranges.items()
+    }
     return dataclasses.replace(hyper, **drawn)
 
 
-def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float) -> dict[str, Any]:
-    """Trains every draw until its steps are done or the time is up; curves have one entry per chunk and draw."""
+def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float, episodes: int) -> dict[str, Any]:
+    """Trains every draw until its steps are done or the time is up, then evaluates it over `episodes` episodes.
+
+    Curves have one entry per chunk and draw; evaluations are means over episodes, one per draw, of sampled and of mean
+    actions.
+    """
     config = run.config
     keys = jax.vmap(jax.random.key)(jnp.arange(seed, seed + draws))
     begin = time.monotonic()
     state = jax.jit(jax.vmap(lambda h, k: learner.init(run, h, k)))(hyper, keys)
     chunk = jax.jit(jax.vmap(lambda h, s: learner.train_chunk(run, h, s, config.log_interval)), donate_argnums=1)
-    curves: dict[str, list[list[float | None]]] = {name: [] for name in CURVE}
+    curves: dict[str, list[list[float | None]]] = {}
     marks = []
     for done in range(config.num_chunks):
         state, metrics = chunk(hyper, state)
         metrics = jax.device_get(metrics)
-        for name in CURVE:
+        for name in metrics:
+            if name not in CURVE and not name.startswith(("info/", "fear/", "regret/")):
+                continue
+            curves.setdefault(name, [])
             values = np.asarray(metrics[name]).reshape(draws, -1)
             curves[name].append([float(np.nanmean(row)) if np.isfinite(row).any() else None for row in values])
         marks.append(round(time.monotonic() - begin, 2))
@@ -59,7 +68,11 @@ def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float) -> dict[
             break
     steps = [(i + 1) * config.batch_size * config.log_interval for i in range(len(marks))]
     rate = draws * (steps[-1] - steps[0]) / max(marks[-1] - marks[0], 1e-9)
-    return {"steps": steps, "seconds": marks, "steps_per_second": rate, "curves": curves}
+    found = {"steps": steps, "seconds": marks, "steps_per_second": rate, "curves": curves}
+    for how in ("sampled", "mean") if episodes else ():
+        judge = jax.jit(jax.vmap(lambda s: evaluate(run, s, episodes, deterministic=how == "mean")))  # noqa: B023
+        found[f"evaluation_{how}"] = {k: x.mean(1).tolist() for k, x in jax.device_get(judge(state)).items()}
+    return found
 
 
 def main() -> None:
@@ -71,6 +84,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", default="1e6")
     parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--episodes", type=int, default=0, help="evaluate every draw at the end over so many episodes")
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
     arguments = parser.parse_intermixed_args()
@@ -82,7 +96,7 @@ def main() -> None:
     pairs = [pair.split("=") for pair in arguments.vary.split(",") if pair]
     ranges: Ranges = {name: (float(bounds.split(":")[0]), float(bounds.split(":")[1])) for name, bounds in pairs}
     hyper = draw(run, arguments.draws, arguments.seed, ranges)
-    found = search(run, hyper, arguments.draws, arguments.seed, arguments.seconds)
+    found = search(run, hyper, arguments.draws, arguments.seed, arguments.seconds, arguments.episodes)
     found["drawn"] = {n: np.asarray(getattr(hyper, n)).tolist() for n in ranges}
     found |= {"task": arguments.task, "method": arguments.method, "fixed": arguments.fixed}
     found |= {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "engine": run.vector.env.engine}

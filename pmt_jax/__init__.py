@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .config import Config, load_config
-    from .evaluate import evaluate
+    from .evaluation import evaluate
     from .learner import init, make_train, train_step
     from .methods import METHODS, Method
     from .run import setup
@@ -21,7 +21,7 @@ _PLACES = {
     "Config": "config",
     "METHODS": "methods",
     "Method": "methods",
-    "evaluate": "evaluate",
+    "evaluate": "evaluation",
     "init": "learner",
     "load_config": "config",
     "make_train": "learner",

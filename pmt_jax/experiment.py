@@ -25,7 +25,7 @@ from . import learner
 from .checkpoint import Checkpoints
 from .config import Config, load_config, to_toml
 from .errors import UsageError
-from .evaluate import evaluate
+from .evaluation import evaluate
 from .run import Run, setup
 from .sinks import Jsonl, Progress, Sink, duration
 from .types import LearnerState, Metrics

@@ -17,6 +17,9 @@ from .tasks import EnvSpec
 from .types import Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "tanh": nn.tanh, "elu": nn.elu}
+# Nobody is afraid before the first harm: fear starts at sigmoid(-4) = 0.018. Starting at one half, it takes tens of
+# updates to come down, and all the while its noise drowns the first real danger.
+FEARLESS = -4.0
 _GAINS = {"relu": math.sqrt(2), "tanh": 5 / 3, "elu": 1.0}
 
 
@@ -29,6 +32,7 @@ class MLP(nn.Module):
     activation: str = "relu"
     layer_norm: bool = True
     input_norm: bool = False
+    head_bias: float = 0.0
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -37,7 +41,8 @@ class MLP(nn.Module):
             x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(_GAINS[self.activation]))(x)
             x = _ACTIVATIONS[self.activation](x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
-        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_gain))(x)
+        head_init, bias_init = nn.initializers.orthogonal(self.head_gain), nn.initializers.constant(self.head_bias)
+        return nn.Dense(self.outputs, kernel_init=head_init, bias_init=bias_init)(x)
 
 
 class Actor(nn.Module):
@@ -127,10 +132,9 @@ def _apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
 def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
     """The networks of a run."""
 
-    def mlp(outputs: int, head_gain: float) -> MLP:
-        return MLP(
-            config.hidden, outputs, head_gain, config.activation, config.layer_norm, config.obs_norm == "layernorm"
-        )
+    def mlp(outputs: int, head_gain: float, head_bias: float = 0.0) -> MLP:
+        input_norm = config.obs_norm == "layernorm"
+        return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm, head_bias)
 
     return Networks(
         num_actors=1 if share_actor else spec.num_agents,
@@ -141,6 +145,6 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         actor=Actor(mlp(spec.action_dim, 0.01)),
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
-        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
+        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01, FEARLESS),
         regret_net=mlp(spec.action_dim, 0.01),
     )

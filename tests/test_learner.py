@@ -13,7 +13,7 @@ import pytest
 
 import envs
 from envs.toys import Lane
-from pmt_jax import learner, load_config, make_train, policy_update, rollout, setup
+from pmt_jax import METHODS, learner, load_config, make_train, policy_update, rollout, setup
 from pmt_jax.types import LearnerState, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
@@ -49,6 +49,35 @@ def test_happo_and_mappo_are_the_same_with_one_agent():
     happo, _ = small_run("happo", env=(("num_agents", 1),))
     mappo, _ = small_run("mappo", env=(("num_agents", 1),))
     chex.assert_trees_all_equal(weights(happo), weights(mappo))
+
+
+def test_regret_that_is_cut_to_nothing_makes_r4sg_mappo_l_and_mixed_f4sg():
+    chex.assert_trees_all_equal(weights(small_run("r4sg", regret_max=0.0)[0]), weights(small_run("mappo_l")[0]))
+    chex.assert_trees_all_equal(weights(small_run("mixed", regret_max=0.0)[0]), weights(small_run("f4sg")[0]))
+
+
+def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(learner, "_appraise_fear", lambda run, hyper, net, batch, key: (net, batch.cost, {}))
+    fearful, _ = small_run.__wrapped__("f4sg")
+    chex.assert_trees_all_equal(weights(fearful), weights(small_run("mappo_l")[0]))
+
+
+class Harmless(Lane):
+    """`lane` where nothing ever costs."""
+
+    def _get_cost(self, position, action, key):
+        return jnp.zeros_like(position)
+
+
+def test_regret_stands_still_where_nothing_ever_costs():
+    def trained(method: str) -> LearnerState:
+        return jax.jit(make_train(load_config("lane", method=method, **SMALL), Harmless()))(jax.random.key(0))[0]
+
+    regretful = trained("r4sg")
+    chex.assert_trees_all_equal(weights(regretful), weights(trained("mappo_l")))
+    run = setup(load_config("lane", method="r4sg", **SMALL), Harmless())
+    start = learner.init(run, run.hyper, jax.random.key(0))
+    chex.assert_trees_all_close(regretful.regret.params, start.regret.params, rtol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -110,9 +139,11 @@ def test_jitted_or_not():
     chex.assert_trees_all_close(weights(jitted), weights(plain), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["mappo", "happo", "mappo_l"])
-def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str):
-    run = setup(load_config("lane", method=method, **SMALL))
+@pytest.mark.parametrize("env", [None, {"num_agents": 1}, "two costs"])
+@pytest.mark.parametrize("method", METHODS)
+def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str, env: object):
+    own = TwoDangers() if env == "two costs" else envs.make("lane", **env) if isinstance(env, dict) else None
+    run = setup(load_config("lane", method=method, **SMALL), own)
     before = jax.eval_shape(functools.partial(learner.init, run), run.hyper, jax.random.key(0))
     after, _ = jax.eval_shape(functools.partial(learner.train_step, run), run.hyper, before)
     chex.assert_trees_all_equal_structs(before, after)
@@ -193,10 +224,10 @@ def test_observations_are_normalised_with_what_was_seen_before():
 
 
 @functools.cache
-def learned(task: str, method: str) -> tuple[np.ndarray, np.ndarray]:
+def learned(task: str, method: str, **changes: str) -> tuple[np.ndarray, np.ndarray]:
     """Mean episode cost and reward of the last 15 of 100 updates, for two seeds."""
     keys = jax.random.split(jax.random.key(1), 2)
-    _, metrics = jax.jit(jax.vmap(make_train(load_config(task, method=method))))(keys)
+    _, metrics = jax.jit(jax.vmap(make_train(load_config(task, method=method, **changes))))(keys)
     return tuple(np.asarray(metrics[name])[:, -15:].mean(1) for name in ("episode_cost", "episode_reward"))
 
 
@@ -208,10 +239,44 @@ def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
 
 
 @pytest.mark.parametrize(("task", "most_cost", "least_reward"), [("lane", 4, 15), ("switch", 3, 7)])
-@pytest.mark.parametrize("method", ["mappo_l"])
+@pytest.mark.parametrize("method", ["mappo_l", "macpo", "f4sg", "r4sg", "mixed"])
 def test_safe_methods_learn_near_the_limit(task: str, method: str, most_cost: float, least_reward: float):
     cost, reward = learned(task, method)
     assert (cost <= most_cost).all() and (reward >= least_reward).all()
+
+
+def test_fear_of_the_current_state_cannot_see_what_an_action_costs():
+    """On `switch` only the next state knows the action; fear of the current one gives it no blame."""
+    cost, _ = learned("switch", "f4sg")
+    assert (cost <= 3).all()
+    cost, _ = learned("switch", "f4sg", fear_time="current")
+    assert (cost >= 20).all()
+
+
+def test_fear_sees_through_noise_where_the_cost_itself_does_not():
+    """On `noisy` (limit 0.5) a step beyond costs three times in ten: fear learns the 0.3, the cost signal is noise."""
+    fearful, _ = learned("noisy", "f4sg")
+    assert (fearful <= 1.5).all()
+    lagrangian, _ = learned("noisy", "mappo_l")
+    assert (lagrangian >= 3).all()
+
+
+def test_the_letter_of_the_paper_runs():
+    for preset in ("paper_letter", "reference"):
+        for method in ("mixed", "macpo"):
+            config = load_config("lane", method=method, preset=preset, **SMALL)
+            state, metrics = jax.jit(make_train(config))(jax.random.key(0))
+            for x in jax.tree.leaves((weights(state), metrics["actor/loss"])):
+                assert np.isfinite(x).all()
+
+
+def test_diagnostics_of_fear_and_regret():
+    _, metrics = small_run("mixed")
+    names = "fear/brier fear/ece fear/on_costly fear/on_safe regret/on_costly regret/weight_mean regret/weight_std"
+    assert set(names.split()) <= set(metrics)
+    assert metrics["actor/kl_per_agent"].shape == (1, 3, 2)
+    _, metrics = small_run("macpo")
+    assert {"actor/case", "actor/line_search_steps"} <= set(metrics)
 
 
 def test_the_environments_of_the_toys_are_what_the_configurations_name():

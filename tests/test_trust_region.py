@@ -84,7 +84,7 @@ def test_line_search_takes_the_first_that_is_accepted():
 
 
 def test_gradients_and_curvature_of_a_linear_gaussian_policy():
-    """One step of N(theta, sd^2), A = a.u, A_c = a.w: the gradient of the surrogates is -u and w, the curvature 1/sd^2."""
+    """N(theta, sd^2), A = a.u, A_c = a.w: the gradients of the surrogates are u and w, the curvature is 1/sd^2."""
     from pmt_jax import distributions
 
     sd, rows = 0.3, 100_000
