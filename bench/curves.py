@@ -62,6 +62,7 @@ def draw(runs: list[dict[str, Any]], png: pathlib.Path) -> None:
         axis.grid(alpha=0.3)
     axes[1].axhline(runs[0]["cost_limit"], color="k", ls="--", lw=1)
     axes[1].set_yscale("symlog", linthresh=10)
+    axes[1].set_ylim(bottom=0)
     axes[0].legend(frameon=False)
     figure.suptitle(f"{runs[0]['task']}, {len(runs[0]['seeds'])} seeds (mean, lowest and highest)")
     figure.savefig(png, dpi=110)

@@ -100,11 +100,13 @@ def _add_train(commands: Any) -> None:
 def _add_eval(commands: Any) -> None:
     evaluation = commands.add_parser(
         "eval",
-        help="evaluate a trained run: pmt eval runs/x",
-        description="Reward, cost and violation rate of a run's final policies over whole episodes with fixed keys.",
+        help="evaluate a trained run: pmt eval runs/x; or a baseline: pmt eval voltage_33 --policy droop",
+        description="Reward, cost, violation rate and the task's own figures over whole episodes with fixed keys.",
         allow_abbrev=False,
     )
-    evaluation.add_argument("folder", metavar="RUN", type=pathlib.Path, help="a run folder")
+    evaluation.add_argument("source", metavar="RUN|TASK", help="a run folder, or with --policy a task's name")
+    evaluation.add_argument("--policy", help="a policy that is not learned: zero, random, droop or opf (voltage tasks)")
+    evaluation.add_argument("--env", action="append", default=[], metavar="NAME=VALUE", help="the task's own options")
     evaluation.add_argument("--episodes", default="32", help="episodes per seed (default 32)")
     evaluation.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
     evaluation.set_defaults(run=_eval)
@@ -137,11 +139,17 @@ def _eval(arguments: argparse.Namespace) -> int:
     _quiet_xla()
     from . import experiment
 
-    rows = experiment.evaluate_run(arguments.folder, int(arguments.episodes), arguments.deterministic)
-    how = "mean actions" if arguments.deterministic else "sampled actions"
-    print(f"{arguments.folder}: {arguments.episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
+    episodes = int(arguments.episodes)
+    if arguments.policy:
+        options = dict(settings.convert("env", arguments.env))
+        rows = [experiment.evaluate_baseline(arguments.source, arguments.policy, episodes, options)]
+        how = f"policy {arguments.policy}"
+    else:
+        rows = experiment.evaluate_run(pathlib.Path(arguments.source), episodes, arguments.deterministic)
+        how = "mean actions" if arguments.deterministic else "sampled actions"
+    print(f"{arguments.source}: {episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
     for row in rows:
-        print(f"seed {row['seed']} (cost limit {row['cost_limit']:g} an episode)")
+        print(f"seed {row.get('seed', '-')} (cost limit {row['cost_limit']:g} an episode)")
         for name, figures in row.items():
             if isinstance(figures, tuple):
                 print(f"  {name:24} {figures[0]:12.4f} +- {figures[1]:.4f}")

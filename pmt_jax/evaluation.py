@@ -5,6 +5,8 @@ Counting first episodes only keeps short episodes from being counted more often 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -13,6 +15,8 @@ from .run import Run
 from .types import LearnerState, Metrics
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
+
+Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
 
 
 def evaluate(run: Run, state: LearnerState, episodes: int, *, deterministic: bool) -> Metrics:
@@ -25,37 +29,52 @@ def evaluate(run: Run, state: LearnerState, episodes: int, *, deterministic: boo
       deterministic: take the mean action instead of a sample.
 
     Returns:
+      The figures of `play`.
+    """
+    key = jax.random.key(EVALUATION_KEY)
+    running = run.config.obs_norm == "running"
+
+    def act(env: tasks.State, t: jax.Array) -> jax.Array:
+        obs = normalise.normalise_obs(state.obs_moments, env.obs) if running else env.obs
+        mean, std = run.nets.policies(state.actor.params, obs)
+        noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
+        return mean + std * noise
+
+    return play(run.vector.env, act, episodes)
+
+
+def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
+    """`episodes` whole episodes of any policy, from starts that are always the same.
+
+    Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent) and the task's info (means over the episode), each
       [episodes]; all undiscounted.
     """
-    vector = tasks.VectorEnv(run.vector.env, episodes)
-    key = jax.random.key(EVALUATION_KEY)
-    running = run.config.obs_norm == "running"
+    vector = tasks.VectorEnv(env, episodes)
     mask = jnp.asarray(vector.spec.action_mask)
 
-    def step(carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array) -> tuple[tuple, None]:
-        envs, alive, sums = carry
-        obs = normalise.normalise_obs(state.obs_moments, envs.env.obs) if running else envs.env.obs
-        mean, std = run.nets.policies(state.actor.params, obs)
-        noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
-        envs, outcome = vector.step(envs, (mean + std * noise) * mask)
+    def step(
+        carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array
+    ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
+        state, alive, sums = carry
+        state, outcome = vector.step(state, act(state.env, t) * mask)
         cost = outcome.cost.sum(-1)
         now = {
             "episode_reward": outcome.reward,
             "episode_cost": cost.mean(-1),
             "episode_length": jnp.ones_like(outcome.reward),
-            "violation_rate": (cost.max(-1) > 0).astype(outcome.reward.dtype),
-            **{f"info/{name}": x.astype(outcome.reward.dtype) for name, x in outcome.info.items()},
+            "violation_rate": cost.max(-1) > 0,
+            **{f"info/{name}": x for name, x in outcome.info.items()},
         }
         sums = {name: sums[name] + alive * now[name] for name in sums}
-        return (envs, alive & ~(outcome.terminated | outcome.truncated), sums), None
+        return (state, alive & ~(outcome.terminated | outcome.truncated), sums), None
 
-    envs = vector.reset(jax.random.fold_in(key, vector.horizon))
+    start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))
     names = ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
-    names += [f"info/{name}" for name in envs.env.info]
-    sums = {name: jnp.zeros(episodes) for name in names}
-    start = (envs, jnp.ones(episodes, bool), sums)
-    (_, _, sums), _ = jax.lax.scan(step, start, jnp.arange(vector.horizon))
+    names += [f"info/{name}" for name in start.env.info]
+    sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
+    carry = (start, jnp.ones(episodes, bool), sums)
+    (_, _, sums), _ = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
     per_step = [name for name in sums if not name.startswith("episode_")]
     return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}}

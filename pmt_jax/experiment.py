@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import learner
+from . import learner, tasks
 from .checkpoint import Checkpoints
 from .config import Config, load_config, to_toml
 from .errors import UsageError
-from .evaluation import evaluate
+from .evaluation import evaluate, play
 from .run import Run, setup
 from .sinks import Jsonl, Progress, Sink, duration
 from .types import LearnerState, Metrics
@@ -311,12 +311,32 @@ def evaluate_run(folder: pathlib.Path, episodes: int, deterministic: bool) -> li
     run, state = load_run(folder)
     program = jax.jit(jax.vmap(lambda s: evaluate(run, s, episodes, deterministic=deterministic)))
     results = jax.device_get(program(state))
-    half, ddof = 1.96 / math.sqrt(episodes), min(1, episodes - 1)
     return [
         {
             "seed": run.config.seed + i,
             "cost_limit": float(run.hyper.cost_limit),
-            **{name: (float(x[i].mean()), half * float(x[i].std(ddof=ddof))) for name, x in results.items()},
+            **_intervals({name: x[i] for name, x in results.items()}),
         }
         for i in range(run.config.seeds)
     ]
+
+
+def evaluate_baseline(task: str, policy: str, episodes: int, options: dict[str, Any]) -> dict[str, Any]:
+    """Evaluates a policy that is not learned, over the same episodes as `evaluate_run`.
+
+    Raises:
+      UsageError: unknown task, option or policy.
+    """
+    env = tasks.make(task, **options)
+    act = jax.vmap(tasks.baseline(env, policy))
+    results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes))())
+    return {"cost_limit": env.spec.cost_limit, **_intervals(results)}
+
+
+def _intervals(results: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """Of figures [episodes]: the mean and the half-width of its 95 % interval."""
+
+    def interval(x: np.ndarray) -> tuple[float, float]:
+        return float(x.mean()), 1.96 * float(x.std(ddof=min(1, len(x) - 1))) / math.sqrt(len(x))
+
+    return {name: interval(x) for name, x in results.items()}

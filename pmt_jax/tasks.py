@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import importlib
 import types
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
 
 if TYPE_CHECKING:
+    import jax
+
     from envs.base import Env, EnvSpec, State
     from envs.vector import Outcome, VectorEnv, VectorState
 
-__all__ = ["Env", "EnvSpec", "Outcome", "State", "VectorEnv", "VectorState", "did_you_mean", "make", "names"]
+__all__ = [
+    "Env",
+    "EnvSpec",
+    "Outcome",
+    "State",
+    "VectorEnv",
+    "VectorState",
+    "baseline",
+    "did_you_mean",
+    "make",
+    "names",
+]
 
 
 def _envs() -> types.ModuleType:
@@ -46,6 +59,22 @@ def names() -> list[str]:
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """The nearest of `choices` as '; did you mean ...?', or all of them where none is near."""
     return _envs().errors.did_you_mean(word, choices)
+
+
+def baseline(env: Env, name: str) -> Callable[[State], jax.Array]:
+    """A policy that nobody has to learn: state -> action [N, A].
+
+    Raises:
+      UsageError: unknown policy, or a task that has none.
+    """
+    package = _envs().__name__
+    grid = importlib.import_module(f"{package}.voltage_control")
+    if not isinstance(env, grid.VoltageControl):
+        raise UsageError(f"task '{env.spec.name}' has no baseline policies; the voltage tasks have")
+    known = importlib.import_module(f"{package}.voltage_baselines").POLICIES
+    if name not in known:
+        raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
+    return known[name](env)
 
 
 def make(name: str, physics: str = "auto", **options: Any) -> Env:
