@@ -3,6 +3,8 @@
     python -m bench.search ant_2x4 --draws 32 --steps 1e6 --vary actor_lr=1e-4:2e-3,lambda_lr=0.3:30 --out found.json \\
         num_envs=64 env=observation=raw
 
+    python -m bench.search --summarise found.json other.json --out bench/results/search_ant.json
+
 Settings after the options are fixed for all draws; those of --vary are drawn log-uniformly from their ranges. Without
 any, the draws are plain seeds. Every draw starts from its own seed, so a single good figure may be luck: confirm the
 winner on fresh seeds before believing it.
@@ -75,9 +77,21 @@ def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float, episodes
     return found
 
 
+def summarise(found: dict[str, Any]) -> dict[str, Any]:
+    """A search without its curves: per draw, reward and steps with cost per 1,000 steps over the last eighth."""
+    last = max(1, len(found["steps"]) // 8)
+    curves = found.pop("curves")
+    reward = 1000 * np.asarray(curves["step_reward"], float)[-last:].mean(0)
+    cost = 1000 * np.asarray(curves["violation_rate"], float)[-last:].mean(0)
+    found["steps"], found["seconds"] = found["steps"][-1], found["seconds"][-1]
+    found["drawn"] = {name: np.round(x, 6).tolist() for name, x in found["drawn"].items()}
+    return {**found, "reward_per_1000": reward.round(1).tolist(), "costly_per_1000": cost.round(2).tolist()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task")
+    parser.add_argument("task", nargs="?")
+    parser.add_argument("--summarise", nargs="+", type=pathlib.Path, metavar="FILE")
     parser.add_argument("--method", default="mappo_l")
     parser.add_argument("--draws", type=int, default=32)
     parser.add_argument("--vary", default="", metavar="NAME=LOW:HIGH,...", help="which settings are drawn, from where")
@@ -88,6 +102,10 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
     arguments = parser.parse_intermixed_args()
+    if arguments.summarise:
+        searches = [{"name": p.stem, **summarise(json.loads(p.read_text()))} for p in arguments.summarise]
+        arguments.out.write_text(json.dumps(searches, indent=0) + "\n")
+        return
     fixed: dict[str, Any] = dict(pair.split("=", 1) for pair in arguments.fixed)
     if "env" in fixed:
         fixed["env"] = fixed["env"].split(",")
