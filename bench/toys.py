@@ -47,11 +47,11 @@ def measure(task: str, method: str, **changes: Any) -> dict[str, Any]:
 FIGURES = ("episode_cost", "episode_reward", "lambda")
 
 
-def interval(values: list[float]) -> str:
+def interval(values: list[float], digits: int = 2) -> str:
     """Mean and 95 % bootstrap interval over seeds."""
     x, rng = np.asarray(values), np.random.default_rng(0)
     low, high = np.quantile(rng.choice(x, (10_000, len(x))).mean(1), [0.025, 0.975])
-    return f"{x.mean():.2f} [{low:.2f}, {high:.2f}]"
+    return f"{x.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def table(rows: list[dict[str, Any]]) -> str:

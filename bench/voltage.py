@@ -1,0 +1,89 @@
+"""All methods on voltage_33 at equal budget, beside policies that nobody had to learn.
+
+    python -m bench.voltage --steps 3e5 --out bench/results/voltage_33.json    trains 7 methods x 5 seeds on a CPU
+    python -m bench.voltage --from bench/results/voltage_33.json               prints the table
+
+CR: controllable rate, the share of steps with every bus in the band. PL: losses in lines, MW. Means over the same
+64 whole episodes for everybody; learned policies take their mean action; intervals are bootstrapped over seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pmt_jax import METHODS, load_config, setup
+from pmt_jax.experiment import evaluate_baseline
+
+from .search import search
+from .toys import interval
+
+TASK, SEEDS, EPISODES = "voltage_33", 5, 64
+FIGURES = {
+    "CR": "info/totally_controllable_ratio",
+    "PL": "info/total_line_loss",
+    "q_loss": "info/q_loss",
+    "reward": "episode_reward",
+    "cost": "episode_cost",
+}
+
+
+def learned(method: str, steps: str, **changes: Any) -> dict[str, Any]:
+    """One method's figures per seed, and how long it took."""
+    run = setup(load_config(TASK, method=method, steps=steps, log_interval=5, **changes))
+    hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (SEEDS,)), run.hyper)
+    begin = time.monotonic()
+    found = search(run, hyper, SEEDS, seed=0, seconds=1e9, episodes=EPISODES)
+    figures = {name: found["evaluation_mean"][key] for name, key in FIGURES.items()}
+    rates = {"seconds": round(time.monotonic() - begin, 1), "steps_per_second": round(found["steps_per_second"])}
+    return {"policy": method, "steps": found["steps"][-1], **rates, **figures}
+
+
+def given(policy: str) -> dict[str, Any]:
+    """A baseline's figures over the same episodes."""
+    results = evaluate_baseline(TASK, policy, EPISODES, {})
+    return {"policy": policy, **{name: [results[key][0]] for name, key in FIGURES.items()}}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = ["| policy | CR | PL, MW | episode reward | episode cost |", "|---|---|---|---|---|"]
+    for row in rows:
+        cells = [
+            f"{row[name][0]:.3f}" if len(row[name]) == 1 else interval(row[name], 3)
+            for name in ("CR", "PL", "reward", "cost")
+        ]
+        lines.append(f"| {row['policy']} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", default="3e5")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--out", type=pathlib.Path)
+    parser.add_argument("--from", dest="source", type=pathlib.Path)
+    parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
+    arguments = parser.parse_intermixed_args()
+    if arguments.source:
+        print(table(json.loads(arguments.source.read_text())["rows"]))
+        return
+    changes = dict(pair.split("=", 1) for pair in arguments.fixed)
+    rows = [given(policy) for policy in ("zero", "droop", "opf")]
+    print(table(rows), flush=True)
+    for method in arguments.methods:
+        rows.append(learned(method, arguments.steps, **changes))
+        print(table(rows[-1:]).splitlines()[-1], rows[-1]["seconds"], "s", flush=True)
+        if arguments.out:
+            versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
+            arguments.out.write_text(json.dumps({"versions": versions, "changes": changes, "rows": rows}) + "\n")
+
+
+if __name__ == "__main__":
+    main()
