@@ -140,6 +140,12 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
     assert rows(out)[-1]["step"] < 2000
 
 
+def test_output_that_nobody_reads_any_more(finished: pathlib.Path):
+    command = f"{sys.executable} -m pmt_jax.cli eval {finished} --episodes 2 | true"
+    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert "Traceback" not in result.stderr and "BrokenPipe" not in result.stderr
+
+
 def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
     assert "it has no config.toml" in cli("eval", tmp_path)[2]
     assert "there is no run to resume" in cli("train", "lane", "--out", tmp_path / "x", "--resume")[2]
@@ -166,6 +172,10 @@ def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
         (["train", "lane", "--resume"], "--resume needs --out"),
         (["eval", "runs/none", "--episodes", "0"], "--episodes must be a whole number of at least 1"),
         (["eval", "runs/none"], "runs/none is not a run folder"),
+        (["eval", "lane", "--policy", "zero"], "task 'lane' has no baseline policies"),
+        (["eval", "voltage_33", "--policy", "dropp"], "unknown policy 'dropp'; did you mean 'droop'?"),
+        (["train", "lane", "--preset", "paper"], "unknown preset 'paper'; did you mean 'paper_letter'?"),
+        (["train", "ant_2x4", "--physics", "warp"], "physics 'warp' needs an NVIDIA GPU"),
     ],
 )
 def test_mistakes_get_one_sentence_and_exit_code_2(arguments: list[str], says: str, cli, tmp_path, monkeypatch):
