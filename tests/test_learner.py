@@ -20,8 +20,10 @@ SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval
 
 
 @functools.cache
-def small_run(method: str, seeds: int = 1, **overrides) -> tuple[LearnerState, dict[str, jax.Array]]:
-    config = load_config("lane", method=method, **{**SMALL, **overrides})
+def small_run(
+    method: str, seeds: int = 1, task: str = "lane", **overrides
+) -> tuple[LearnerState, dict[str, jax.Array]]:
+    config = load_config(task, method=method, **{**SMALL, **overrides})
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     return jax.jit(jax.vmap(make_train(config)))(keys)
 
@@ -52,14 +54,31 @@ def test_happo_and_mappo_are_the_same_with_one_agent():
 
 
 def test_regret_that_is_cut_to_nothing_makes_r4sg_mappo_l_and_mixed_f4sg():
-    chex.assert_trees_all_equal(weights(small_run("r4sg", regret_max=0.0)[0]), weights(small_run("mappo_l")[0]))
-    chex.assert_trees_all_equal(weights(small_run("mixed", regret_max=0.0)[0]), weights(small_run("f4sg")[0]))
+    """On `switch`, where costs are there to be regretted from the first step."""
+
+    def same(method: str, other: str) -> None:
+        regretless, _ = small_run(method, task="switch", regret_max=0.0)
+        chex.assert_trees_all_equal(weights(regretless), weights(small_run(other, task="switch")[0]))
+
+    same("r4sg", "mappo_l")
+    same("mixed", "f4sg")
+
+
+@pytest.mark.parametrize("response", ["one_sided", "advantage"])
+def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
+    plain = weights(small_run("mappo_l", task="switch")[0])
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(
+            weights(small_run("r4sg", task="switch", regret_response=response)[0]), plain, rtol=1e-4
+        )
+    without, _ = small_run("r4sg", task="switch", regret_response=response, regret_max=0.0)
+    chex.assert_trees_all_close(weights(without), plain, rtol=1e-4, atol=1e-5)
 
 
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(learner, "_appraise_fear", lambda run, hyper, net, batch, key: (net, batch.cost, {}))
-    fearful, _ = small_run.__wrapped__("f4sg")
-    chex.assert_trees_all_equal(weights(fearful), weights(small_run("mappo_l")[0]))
+    fearful, _ = small_run.__wrapped__("f4sg", task="switch")
+    chex.assert_trees_all_equal(weights(fearful), weights(small_run("mappo_l", task="switch")[0]))
 
 
 class Harmless(Lane):
