@@ -9,12 +9,13 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+import pmt_jax
+
 from . import config as settings
 from . import tasks
 from .errors import UsageError
 from .methods import METHODS
 
-_POSITIONAL = ("task",)
 _METAVARS = {int: "N", float: "X"}
 
 
@@ -63,8 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> tuple[_Parser, list[str]]:
-    parser = _Parser(prog="pmt", description=__import__("pmt_jax").__doc__, allow_abbrev=False)
-    parser.add_argument("--version", action="version", version=f"pmt {__import__('pmt_jax').__version__}")
+    parser = _Parser(prog="pmt", description=pmt_jax.__doc__, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"pmt {pmt_jax.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     _add_train(commands)
     _add_eval(commands)
@@ -88,7 +89,7 @@ def _add_train(commands: Any) -> None:
     group = train.add_argument_group("settings", "each may also stand in the TOML file")
     defaults = settings.Config()
     for name, text in settings.descriptions().items():
-        if name in _POSITIONAL:
+        if name == "task":  # it is the positional argument
             continue
         kind = settings.FIELDS[name]
         words = " | ".join(METHODS) if name == "method" else settings.expectation(kind)

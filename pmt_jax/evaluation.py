@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from . import normalise, tasks
+from . import tasks
 from .run import Run
 from .types import LearnerState, Metrics
 
@@ -32,11 +32,9 @@ def evaluate(run: Run, state: LearnerState, episodes: int, *, deterministic: boo
       The figures of `play`.
     """
     key = jax.random.key(EVALUATION_KEY)
-    running = run.config.obs_norm == "running"
 
     def act(env: tasks.State, t: jax.Array) -> jax.Array:
-        obs = normalise.normalise_obs(state.obs_moments, env.obs) if running else env.obs
-        mean, std = run.nets.policies(state.actor.params, obs)
+        mean, std = run.nets.policies(state.actor.params, run.scale(state.obs_moments, env.obs))
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         return mean + std * noise
 

@@ -235,7 +235,7 @@ def _rows(run: Run, updates: int, metrics: dict[str, np.ndarray]) -> list[dict[s
             "seed": config.seed + i,
             "task": config.task,
             "method": config.method,
-            "cost_limit": float(run.hyper.cost_limit),
+            "cost_limit": run.cost_limit,
         }
         for name, values in metrics.items():
             row[name] = _reduce(name, np.asarray(values[i]))
@@ -314,7 +314,7 @@ def evaluate_run(folder: pathlib.Path, episodes: int, deterministic: bool) -> li
     return [
         {
             "seed": run.config.seed + i,
-            "cost_limit": float(run.hyper.cost_limit),
+            "cost_limit": run.cost_limit,
             **_intervals({name: x[i] for name, x in results.items()}),
         }
         for i in range(run.config.seeds)

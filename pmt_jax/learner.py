@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -143,12 +144,10 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
 
 def _act(run: Run, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Batch]:
     """Collects a batch with the moments of observations frozen, then adds what was seen to the moments."""
-    running = run.config.obs_norm == "running"
-
-    def normaliser(moments: Any) -> rollout.Normalise:
-        return lambda x: normalise.normalise_obs(moments, x) if running else x
-
-    normalisers = (normaliser(state.obs_moments), normaliser(state.state_moments))
+    normalisers = (
+        functools.partial(run.scale, state.obs_moments),
+        functools.partial(run.scale, state.state_moments),
+    )
     after, batch, (obs, global_state) = rollout.collect(
         run.vector,
         state.rollout,

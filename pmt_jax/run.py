@@ -6,11 +6,13 @@ import dataclasses
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
-from . import networks, tasks
+from . import networks, normalise, tasks
 from .config import HYPER_FIELDS, Config, Hyper
 from .methods import METHODS, Method
+from .types import Moments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,11 +25,19 @@ class Run:
     nets: networks.Networks
 
     @property
+    def cost_limit(self) -> float:
+        """Allowed undiscounted cost of one agent per episode: the config's, or the task's where that is left open."""
+        limit = self.config.cost_limit
+        return self.vector.spec.cost_limit if math.isnan(limit) else limit
+
+    def scale(self, moments: Moments, x: jax.Array) -> jax.Array:
+        """Observations or states as the networks see them: scaled by running `moments` if the config says so."""
+        return normalise.normalise_obs(moments, x) if self.config.obs_norm == "running" else x
+
+    @property
     def hyper(self) -> Hyper:
         """The numbers of `config` that are traced, as f32 scalars; a cost limit left open is the task's."""
-        values = {name: getattr(self.config, name) for name in HYPER_FIELDS}
-        if math.isnan(values["cost_limit"]):
-            values["cost_limit"] = self.vector.spec.cost_limit
+        values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": self.cost_limit}
         traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
         return Hyper(**traced)
 
