@@ -81,8 +81,12 @@ def train(
     except BrokenPipeError:  # standard output's, not the folder's
         raise
     except OSError as error:
-        reason = error.strerror or error
-        say(f"stopped: cannot write into {out}: {reason}. What was saved is whole; make room and continue: {command}")
+        begun = (out / "config.toml").is_file()
+        next_step = f"continue: {command}" if begun else "train again into another --out"
+        say(
+            f"stopped: cannot write into {out}: {error.strerror or error}. What was saved is whole; make room and "
+            f"{next_step}"
+        )
         return 1
     return _farewell(end, run, out, command, say)
 

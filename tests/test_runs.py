@@ -21,7 +21,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmt_jax import checkpoint, doctor, experiment, load_config, load_policy, normalise, numpy_policy, setup
+from pmt_jax import checkpoint, doctor, experiment, load_config, load_policy, normalise, numpy_policy, setup, sinks
 from pmt_jax.evaluation import improves, interval
 from pmt_jax.policy import weights
 
@@ -125,8 +125,6 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
 
 
 def test_sigterm_saves_and_says_how_to_go_on(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
-    from pmt_jax import sinks
-
     write = sinks.Jsonl.write
     monkeypatch.setattr(
         sinks.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(signal.SIGTERM))
@@ -172,9 +170,8 @@ def test_a_damaged_checkpoint_is_noticed_and_the_one_before_taken(whole: pathlib
     assert_same_run(copy, whole)
     for step in (copy / "checkpoints").iterdir():
         damage(step)
-    code, _, err = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
+    code, _, err = cli("eval", copy)
     assert code == 2 and "every checkpoint" in err and "restore one from a backup or train anew" in err
-    assert rows(copy) == [{**row, "seconds": new["seconds"]} for row, new in zip(rows(whole), rows(copy), strict=True)]
 
 
 def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
@@ -188,12 +185,15 @@ def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
     assert_same_run(copy, whole)
 
 
-def test_metrics_that_were_cut_off_before_the_checkpoint(whole: pathlib.Path, copy: pathlib.Path, cli):
+def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli):
+    """And another version of JAX, which is only said."""
+    versions = json.loads((copy / "versions.json").read_text())
+    (copy / "versions.json").write_text(json.dumps(versions | {"jax": "0.1"}))
     metrics = copy / "metrics.jsonl"
     text = metrics.read_text()
     metrics.write_text(text[: len(text) // 2])
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 200)
-    assert code == 0
+    assert code == 0 and "since the run began there changed: jax 0.1 -> " in text
     assert f"{metrics} ends at step 800, but the checkpoint is of step 1,600: the rows between are lost" in text
     steps = [row["step"] for row in rows(copy)]
     assert steps[-1] == STEPS + 200 and 1000 not in steps
@@ -206,9 +206,6 @@ def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
     code, _, err = cli("train", copy / "config.toml", "--out", copy, "--resume")
     assert code == 2
     assert "was simulated by engine 'warp', but physics = auto means 'xla' on this cpu" in err
-    (copy / "versions.json").write_text(json.dumps(versions | {"jax": "0.1"}))
-    code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
-    assert code == 0 and "since the run began there changed: jax 0.1 -> " in text
 
 
 def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
@@ -247,12 +244,8 @@ def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
     for seed in (0, 1):
         known = [row for row in rows(whole) if row["seed"] == seed and row["eval/episode_reward"] is not None]
         safe = [row for row in known if row["eval/episode_cost"] <= row["cost_limit"]]
-        one = (
-            max(safe, key=lambda row: row["eval/episode_reward"])
-            if safe
-            else min(known, key=lambda row: row["eval/episode_cost"])
-        )
-        expected.append(one)
+        by_cost = min(known, key=lambda row: row["eval/episode_cost"])
+        expected.append(max(safe, key=lambda row: row["eval/episode_reward"]) if safe else by_cost)
     text = cli("eval", whole, "--episodes", 4, "--deterministic", "--which", "best")[1]
     assert "mean actions of the best policy" in text
     for row in expected:
