@@ -219,8 +219,11 @@ def _appraise_regret(
     learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
     after = logits(learned.params, state, batch.action)
     new, old = appraisal.regret(after, batch.cost), appraisal.regret(before, batch.cost)
+    bound = hyper.kappa * hyper.clip
     if run.config.regret_response != "letter":  # the other responses answer to regret itself, not to its change
         old = jnp.zeros_like(new)
+    if run.config.regret_response == "advantage":  # no ratio is touched, so there is no clip interval to leave
+        bound = hyper.regret_max
     log_weight = regret_weight(
         new,
         old,
@@ -228,7 +231,7 @@ def _appraise_regret(
         choose=run.config.regret_mask,
         omega=hyper.omega,
         regret_max=hyper.regret_max,
-        bound=hyper.kappa * hyper.clip,
+        bound=bound,
     )
     weight = jnp.exp(log_weight)
     diagnostics = {
