@@ -1,4 +1,4 @@
-"""`pmt train | eval | envs`: words into settings, nothing else."""
+"""`pmt train | eval | render | plot | report | envs`: words into settings, nothing else."""
 
 from __future__ import annotations
 
@@ -69,6 +69,9 @@ def _parser() -> tuple[_Parser, list[str]]:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     _add_train(commands)
     _add_eval(commands)
+    _add_render(commands)
+    _add_plot(commands)
+    _add_report(commands)
     envs = commands.add_parser("envs", help="list the tasks", allow_abbrev=False)
     envs.set_defaults(run=_envs)
     return parser, list(commands.choices)
@@ -116,6 +119,52 @@ def _add_eval(commands: Any) -> None:
     evaluation.set_defaults(run=_eval)
 
 
+def _add_render(commands: Any) -> None:
+    render = commands.add_parser(
+        "render",
+        help="see an episode of a run: pmt render runs/x -o x.html (or .gif, .mp4)",
+        description="Plays one episode and writes it as a film, or as a page that replays it in any browser.",
+        allow_abbrev=False,
+    )
+    render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help="a run folder")
+    render.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("replay.html"), metavar="FILE")
+    render.add_argument("--seed", metavar="K", help="whose policy, of the run's seeds (default: its first)")
+    render.add_argument("--episode", default="0", metavar="N", help="which of the fixed starts (default 0)")
+    render.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
+    render.add_argument(
+        "--steps", default=":", metavar="FROM:TO[:EVERY]", help="the control steps to show (default: all)"
+    )
+    render.add_argument("--fps", default="20", metavar="N", help="control steps shown a second (default 20)")
+    render.add_argument("--size", default="640x360", metavar="WxH", help="pixels of a film (default 640x360)")
+    render.set_defaults(run=_render)
+
+
+def _add_plot(commands: Any) -> None:
+    plot = commands.add_parser(
+        "plot",
+        help="draw the training curves of runs: pmt plot runs/* -o curves.png (or .svg, .pdf)",
+        description="Reward, cost, violations, multiplier and emotions over training; runs that differ in nothing but "
+        "their seeds make one curve: the mean over seeds, in a band from the lowest to the highest.",
+        allow_abbrev=False,
+    )
+    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    plot.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("curves.png"), metavar="FILE")
+    plot.set_defaults(run=_plot)
+
+
+def _add_report(commands: Any) -> None:
+    report = commands.add_parser(
+        "report",
+        help="everything about runs on one page: pmt report runs/* -o report.html",
+        description="Settings, versions, curves, an evaluation with intervals and a replay, in one file.",
+        allow_abbrev=False,
+    )
+    report.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    report.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("report.html"), metavar="FILE")
+    report.add_argument("--episodes", default="32", help="of the evaluation, per seed (default 32)")
+    report.set_defaults(run=_report)
+
+
 def _train(arguments: argparse.Namespace) -> int:
     given = {k.removeprefix("set_"): v for k, v in vars(arguments).items() if k.startswith("set_") and v is not None}
     config = settings.load_config(arguments.source, preset=arguments.preset, **given)
@@ -138,12 +187,10 @@ def _quiet_xla() -> None:
 
 
 def _eval(arguments: argparse.Namespace) -> int:
-    if not arguments.episodes.isdecimal() or int(arguments.episodes) < 1:
-        raise UsageError(f"--episodes must be a whole number of at least 1, not '{arguments.episodes}'")
+    episodes = _whole("--episodes", arguments.episodes, 1)
     _quiet_xla()
     from . import experiment
 
-    episodes = int(arguments.episodes)
     if arguments.policy:
         options = dict(settings.convert("env", arguments.env))
         rows = [experiment.evaluate_baseline(arguments.source, arguments.policy, episodes, options)]
@@ -158,6 +205,58 @@ def _eval(arguments: argparse.Namespace) -> int:
             if isinstance(figures, tuple):
                 print(f"  {name:24} {figures[0]:12.4f} +- {figures[1]:.4f}")
     return 0
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    seed = None if arguments.seed is None else _whole("--seed", arguments.seed, 0)
+    number = _whole("--episode", arguments.episode, 0)
+    steps = [None if part == "" else _whole("--steps", part, 0) for part in arguments.steps.split(":")]
+    if len(steps) not in (2, 3) or steps[2:] == [0]:
+        raise UsageError(f"--steps must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{arguments.steps}'")
+    size = arguments.size.split("x")
+    if len(size) != 2:
+        raise UsageError(f"--size must be WIDTHxHEIGHT in pixels, like 640x360, not '{arguments.size}'")
+    width, height = (_whole("--size", part, 32) for part in size)
+    fps = _whole("--fps", arguments.fps, 1)
+    _quiet_xla()
+    from . import render
+
+    render.render(
+        arguments.run_folder,
+        arguments.out,
+        seed=seed,
+        number=number,
+        deterministic=arguments.deterministic,
+        moments=slice(*steps),
+        fps=fps,
+        size=(width, height),
+        say=_say,
+    )
+    return 0
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    from . import report
+
+    report.plot(arguments.run_folders, arguments.out)
+    _say(f"wrote {arguments.out}")
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    episodes = _whole("--episodes", arguments.episodes, 1)
+    _quiet_xla()
+    from . import report
+
+    report.report(arguments.run_folders, arguments.out, episodes, say=_say)
+    _say(f"wrote {arguments.out}")
+    return 0
+
+
+def _whole(flag: str, text: str, least: int) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise UsageError(f"{flag} must be a whole number of at least {least}, not '{text}'")
+    return int(text)
 
 
 def _envs(arguments: argparse.Namespace) -> int:
