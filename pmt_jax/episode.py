@@ -52,10 +52,13 @@ class Episode:
         return {name: x[t] for name, x in self.raw.items()}
 
     def cut(self, moments: slice) -> Episode:
-        """The part of it that pictures shall show."""
-        names = ("raw", "step", "reward", "cost", "reward_sum", "cost_sum", "info")
-        arrays = {name: getattr(self, name) for name in names}
-        return dataclasses.replace(self, **jax.tree.map(lambda x: x[moments], arrays))
+        """The part of it that pictures shall show; a cost between two moments counts at the later one."""
+        names = ("raw", "step", "reward", "reward_sum", "cost_sum", "info")
+        arrays = jax.tree.map(lambda x: x[moments], {name: getattr(self, name) for name in names})
+        kept = np.arange(len(self))[moments]
+        since = np.concatenate([kept[:1], kept[:-1] + 1])
+        cost = np.array([self.cost[a : b + 1].max() for a, b in zip(since, kept, strict=True)])
+        return dataclasses.replace(self, cost=cost, **arrays)
 
 
 def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, deterministic: bool = False) -> Episode:

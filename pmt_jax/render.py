@@ -22,6 +22,7 @@ from .output import writing
 
 FORMATS = (".mp4", ".gif", ".html")
 SIZE = (640, 360)  # pixels
+COLOURS = 48  # of a GIF
 DANGER, PAPER, INK = (200, 64, 47), (251, 250, 248), (29, 33, 37)
 BACKENDS = {"linux": ("egl", "osmesa", "glfw"), "darwin": ("cgl", "glfw")}
 _PROBE = """
@@ -152,15 +153,15 @@ def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
 
     sketch, voltages = feeder.sketch(episode.env), episode.raw["vm_pu"]
     x, y, (low, high) = sketch.x, -sketch.y, sketch.band
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#%02x%02x%02x" % PAPER)
+    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#{:02x}{:02x}{:02x}".format(*PAPER))
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.03, 0.22, 0.94, 0.72), frameon=False, xticks=[], yticks=[])
     elbows = [[(x[a], y[a]), (x[a], y[b]), (x[b], y[b])] for a, b in sketch.links]
     lines: Any = axes.add_collection(LineCollection(elbows, linewidths=2.5, zorder=1))
     marks = np.isin(np.arange(len(x)), sketch.agents)
-    buses: list[Any] = [
-        axes.scatter(x[m], y[m], s=s, marker=k, zorder=2) for m, s, k in ((~marks, 40, "o"), (marks, 70, "s"))
-    ]
+    area = 40 * min(1, 45 / len(x))
+    looks = ((~marks, area, "o"), (marks, 1.75 * area, "s"))
+    buses: list[Any] = [axes.scatter(x[m], y[m], s=s, marker=k, zorder=2) for m, s, k in looks]
     _colour_bar(figure, sketch.band)
     for v in voltages:
         lines.set_color(feeder.voltage_colours(v[sketch.links].mean(1), sketch.band))
@@ -220,7 +221,7 @@ def _write_film(frames: Iterator[np.ndarray], out: pathlib.Path, fps: float, siz
         from PIL import Image
 
         # Few colours and no dithering: what does not move stays equal from frame to frame, and costs no bytes.
-        pictures = (Image.fromarray(f).quantize(64, dither=Image.Dither.NONE) for f in frames)
+        pictures = (Image.fromarray(f).quantize(COLOURS, dither=Image.Dither.NONE) for f in frames)
         first = next(pictures)
         first.save(out, save_all=True, append_images=pictures, duration=1000 / fps, loop=0, optimize=True)
         return
