@@ -156,10 +156,11 @@ def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#{:02x}{:02x}{:02x}".format(*PAPER))
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.03, 0.22, 0.94, 0.72), frameon=False, xticks=[], yticks=[])
+    area = 40 * min(1, 45 / len(x))  # points^2 of a bus
+    rim = area**0.5 / 3
     elbows = [[(x[a], y[a]), (x[a], y[b]), (x[b], y[b])] for a, b in sketch.links]
-    lines: Any = axes.add_collection(LineCollection(elbows, linewidths=2.5, zorder=1))
+    lines: Any = axes.add_collection(LineCollection(elbows, linewidths=area**0.5 / 2.5, zorder=1))
     marks = np.isin(np.arange(len(x)), sketch.agents)
-    area = 40 * min(1, 45 / len(x))
     looks = ((~marks, area, "o"), (marks, 1.75 * area, "s"))
     buses: list[Any] = [axes.scatter(x[m], y[m], s=s, marker=k, zorder=2) for m, s, k in looks]
     _colour_bar(figure, sketch.band)
@@ -169,7 +170,7 @@ def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
             out = (v[chosen] < low) | (v[chosen] > high)
             dots.set_facecolor(feeder.voltage_colours(v[chosen], sketch.band))
             dots.set_edgecolor(np.where(out[:, None], np.array(INK) / 255, np.array(PAPER) / 255))
-            dots.set_linewidth(np.where(out, 2.0, 0.8))
+            dots.set_linewidth(np.where(out, rim, 0.4 * rim))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3]
 

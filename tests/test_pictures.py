@@ -55,7 +55,7 @@ def still(name: str, raw: dict[str, np.ndarray], cost: list[float]) -> episode.E
 @pytest.fixture(scope="session")
 def ant() -> episode.Episode:
     """The ant in the middle of the corridor, a metre on, and in the danger band, which costs."""
-    qpos = np.tile(tasks.make("ant_2x4").model.qpos0, (3, 1))  # pyright: ignore[reportAttributeAccessIssue]
+    qpos = np.tile(tasks.make("ant_2x4").model.qpos0, (3, 1))
     qpos[1:, 0] = 1.0
     qpos[2, 1] = 4.5
     return still("ant_2x4", {"qpos": qpos}, [0.0, 0.0, 1.0])
@@ -116,7 +116,7 @@ def test_leaving_steps_out_hides_no_cost(ant: episode.Episode):
 def test_a_scene_holds_walls_bands_and_the_moment_of_cost(ant: episode.Episode):
     from pmt_jax import scenes
 
-    model = ant.env.model  # pyright: ignore[reportAttributeAccessIssue]
+    model = ant.env.model
     looks = []
     for scene in scenes.scenes(ant):
         geoms = {model.geom(g.objid).name: g for g in scene.geoms[: scene.ngeom]}
@@ -202,7 +202,7 @@ def test_a_film_of_the_grid(grid: episode.Episode, tmp_path: pathlib.Path, monke
     out = tmp_path / "grid.gif"
     render.render(tmp_path, out, size=(320, 180), say=lambda _: None)
     film = Image.open(out)
-    assert film.size == (320, 180) and film.n_frames == 2  # pyright: ignore[reportAttributeAccessIssue]
+    assert film.size == (320, 180) and film.n_frames == 2
     corners = []
     for frame in range(2):
         film.seek(frame)

@@ -117,9 +117,13 @@ function drawStrip(canvas, data, moment) {
     const tall = (height - middle) * (cost > 0 ? 0.3 + 0.7 * cost / largest : 0);
     pen.fillRect(x(t - 0.5), height - tall, Math.max(1.5, x(1) + 0.5), tall);
   });
-  pen.fillStyle = colour("quiet");
-  pen.fillText("reward of a step", 2, 12);
-  pen.fillText("cost of a step", 2, height - 5);
+  pen.fillStyle = colour("ink");
+  pen.strokeStyle = colour("paper");
+  pen.lineWidth = 3;
+  for (const [words, y] of [["reward of a step", 12], ["cost of a step", height - 6]]) {
+    pen.strokeText(words, 2, y);
+    pen.fillText(words, 2, y);
+  }
   pen.fillStyle = colour("ink");
   pen.fillRect(x(moment) - 1, 0, 2, height);
 }
@@ -172,7 +176,7 @@ function mapView(canvas, data) {
     const [pen, width, height] = fresh(canvas);
     const moment = Math.round(t), v = values.subarray(moment * n, moment * n + n);
     const x = (i) => 18 + map.x[i] * (width - 36), y = (i) => 20 + map.y[i] * (height - 84);
-    const size = Math.max(2.5, Math.min(8, width / 60, width / Math.sqrt(n) / 9));
+    const size = Math.max(2.5, Math.min(8, width / 60, width / Math.sqrt(n) / 10));
     pen.lineCap = "round";
     for (const [a, b] of map.links) {
       pen.strokeStyle = voltageColour((v[a] + v[b]) / 2);
@@ -187,7 +191,7 @@ function mapView(canvas, data) {
       const out = v[i] < low || v[i] > high;
       pen.fillStyle = voltageColour(v[i]);
       pen.strokeStyle = out ? colour("ink") : colour("paper");
-      pen.lineWidth = out ? 2 : 1;
+      pen.lineWidth = out ? Math.max(1, size / 3) : 1;
       pen.beginPath();
       if (agents.has(i)) pen.rect(x(i) - size * 1.2, y(i) - size * 1.2, size * 2.4, size * 2.4);
       else pen.arc(x(i), y(i), out ? size * 1.25 : size, 0, 7);
