@@ -47,6 +47,11 @@ class Episode:
     def __len__(self) -> int:
         return len(self.reward)
 
+    @property
+    def kind(self) -> str:
+        """How it can be drawn: a `scene` of MuJoCo bodies, a `map` of voltages, or `plain` figures over time."""
+        return "scene" if hasattr(self.env, "model") else "map" if hasattr(self.env, "scenario") else "plain"
+
     def at(self, t: int) -> dict[str, np.ndarray]:
         """The raw quantities of moment `t`."""
         return {name: x[t] for name, x in self.raw.items()}

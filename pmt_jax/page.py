@@ -40,11 +40,10 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
       rate: control steps a second.
       play: begin at once (never where the reader's system asks for little motion).
     """
-    env = episode.env
-    kind = "scene" if hasattr(env, "model") else "map" if hasattr(env, "scenario") else "plain"
+    kind = episode.kind
     data: dict[str, Any] = {
         "kind": kind,
-        "title": f"{env.spec.name}, {episode.method}, seed {episode.seed}",
+        "title": f"{episode.env.spec.name}, {episode.method}, seed {episode.seed}",
         "rate": rate,
         "limit": episode.cost_limit,
         "step": episode.step.tolist(),

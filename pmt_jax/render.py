@@ -83,9 +83,9 @@ def render(
 
 def _frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """[height, width, 3] pictures of an episode's moments."""
-    if hasattr(episode.env, "model"):
+    if episode.kind == "scene":
         return _bodies(episode, size, gl_platform())
-    if hasattr(episode.env, "scenario"):
+    if episode.kind == "map":
         return _maps(episode, size)
     raise UsageError(f"task '{episode.env.spec.name}' has no film; write a page instead: -o replay.html")
 

@@ -35,6 +35,7 @@ EMOTIONS = {
 }
 COLOURS = ("#2f7fb5", "#e0861a", "#2f9e77", "#c8503f", "#8d6bb8", "#9a7b4f", "#d264a8", "#7f8a91")
 SEEDS_AND_LENGTH = ("seed", "seeds", "steps", "num_updates")  # settings in which repetitions of a run may differ
+IDENTITY = {"step", "seed", "task", "method", "cost_limit"}  # what every row of a run says of itself
 ENDINGS = (".png", ".svg", ".pdf")
 _INK = "#808182"  # stands for the reader's own text colour in pictures inside pages
 
@@ -110,9 +111,10 @@ def _rows(folder: pathlib.Path) -> dict[tuple[int, int], dict[str, Any]]:
         ) from error
     rows = {}
     for line in text.splitlines():
-        with contextlib.suppress(json.JSONDecodeError, KeyError, TypeError):
+        with contextlib.suppress(json.JSONDecodeError, AttributeError):
             row = json.loads(line)
-            rows[row["step"], row["seed"]] = row
+            if IDENTITY <= row.keys():
+                rows[row["step"], row["seed"]] = row
     return rows
 
 
@@ -331,9 +333,10 @@ def _heading(runs: Sequence[Curves]) -> list[str]:
 
 def _summary(run: Curves) -> str:
     seeds = ", ".join(map(str, run.seeds))
+    took = f" in {run.seconds:,.0f} s" if math.isfinite(run.seconds) else ""
     return (
-        f"{run.method} on {run.task}, seeds {seeds}; {int(run.steps[-1]):,} environment steps a seed in "
-        f"{run.seconds:,.0f} s; limit on an episode's cost {run.cost_limit:g}."
+        f"{run.method} on {run.task}, seeds {seeds}; {int(run.steps[-1]):,} environment steps a seed{took}; "
+        f"limit on an episode's cost {run.cost_limit:g}."
     )
 
 

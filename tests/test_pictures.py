@@ -257,7 +257,14 @@ def row(step: int, seed: int, reward: float | None, **more: object) -> str:
 
 
 def test_figures_are_read_as_they_stand(tmp_path: pathlib.Path):
-    lines = [row(10, 0, None), row(10, 1, 2.0), row(20, 0, 3.0), row(20, 1, 4.0), row(20, 1, 5.0), '{"step": 30, "se']
+    lines = [
+        row(10, 0, None),
+        row(10, 1, 2.0),
+        row(20, 0, 3.0),
+        row(20, 1, 4.0),
+        row(20, 1, 5.0),
+        '{"step": 30, "seed": 0}\n{"step": 30, "se',
+    ]
     curves = report.read(written(tmp_path / "a", lines))
     assert curves.steps.tolist() == [10, 20] and curves.seeds == (0, 1)
     np.testing.assert_array_equal(curves.figures["episode_reward"], [[np.nan, 3], [2, 5]])
