@@ -30,6 +30,8 @@ EMOTIONS = {
     "fear/ece": "fear: calibration error",
     "fear/on_costly": "fear of steps that cost",
     "fear/on_safe": "fear of steps that do not",
+    "regret/on_costly": "regret at steps that cost",
+    "regret/on_safe": "regret at steps that do not",
     "regret/weight_mean": "regret: mean weight of a ratio",
     "regret/weight_std": "regret: spread of the weights",
 }
