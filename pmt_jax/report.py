@@ -31,7 +31,7 @@ EMOTIONS = {
     "fear/on_costly": "fear of steps that cost",
     "fear/on_safe": "fear of steps that do not",
     "regret/on_costly": "regret at steps that cost",
-    "regret/on_safe": "regret at steps that do not",
+    "regret/on_safe": "regret at safe steps, were they costly",
     "regret/weight_mean": "regret: mean weight of a ratio",
     "regret/weight_std": "regret: spread of the weights",
 }
