@@ -53,6 +53,9 @@ SURVIVAL = 1.0
 HEIGHT = (0.2, 1.0)  # m, of the torso
 LEAST_UPRIGHT = -0.7  # cosine of the torso's tilt, 134 degrees
 
+COSTLY_ANT = (0.86, 0.16, 0.12, 1.0)  # what a picture shows at the moment of cost: the ant in red,
+COSTLY_BAND = 0.36  # and the danger bands less transparent
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -177,6 +180,22 @@ class AntCorridor:
             "warmstart": carry.physics.warmstart,
             "torso_xpos": carry.torso_xpos,
         }
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What pictures are drawn from; its geoms include the walls and the danger bands."""
+        return model()
+
+    def decorate(self, scene: mujoco.MjvScene, raw: dict[str, np.ndarray], cost: float) -> None:
+        """Shows the moment of cost in a scene of `model`: a red ant, and bands that glow; see `envs.base`."""
+        del raw
+        if cost <= 0:
+            return
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
+                geom.rgba[:] = COSTLY_ANT
+            elif model().geom(geom.objid).name.startswith("danger"):
+                geom.rgba[3] = COSTLY_BAND
 
     def _first(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
         """A State that no transition led to."""

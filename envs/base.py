@@ -94,3 +94,23 @@ class Env(Protocol):
     def raw(self, state: State) -> dict[str, jax.Array]:
         """The raw quantities of a state: `restore(**raw(state))` continues exactly as `state` would."""
         ...
+
+
+@runtime_checkable
+class Drawn(Protocol):
+    """What an environment of MuJoCo bodies offers beyond `Env` to be seen; its `raw` must then hold `qpos`.
+
+    Bodies that follow no joint move by `mocap_pos` and `mocap_quat` in `raw`, where it holds them.
+    """
+
+    model: Any  # the mujoco.MjModel that pictures are drawn from; its first camera, if any, is the view
+
+    def decorate(self, scene: Any, raw: dict[str, np.ndarray], cost: float) -> None:
+        """Changes a mujoco.MjvScene of `model` before it is drawn, by colours or by geoms appended to it.
+
+        Args:
+          scene: of the moment that `raw` describes.
+          raw: the raw quantities of that moment, without a batch axis.
+          cost: of the step that led there, mean over agents, summed over costs.
+        """
+        ...

@@ -1,4 +1,4 @@
-"""`pmt train | eval | export | doctor | envs`: words into settings, nothing else."""
+"""`pmt train | eval | export | render | plot | report | doctor | envs`: words into settings, nothing else."""
 
 from __future__ import annotations
 
@@ -72,6 +72,9 @@ def _parser() -> tuple[_Parser, list[str]]:
     _add_export(commands)
     doctor = commands.add_parser("doctor", help="what of this machine can be used, and why not the rest")
     doctor.set_defaults(run=_doctor)
+    _add_render(commands)
+    _add_plot(commands)
+    _add_report(commands)
     envs = commands.add_parser("envs", help="list the tasks", allow_abbrev=False)
     envs.set_defaults(run=_envs)
     return parser, list(commands.choices)
@@ -141,6 +144,52 @@ def _add_export(commands: Any) -> None:
 
 def _add_which(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--which", default="last", metavar="WORD", help="which learner state: last (default) | best")
+
+
+def _add_render(commands: Any) -> None:
+    render = commands.add_parser(
+        "render",
+        help="see an episode of a run: pmt render runs/x -o x.html (or .gif, .mp4)",
+        description="Plays one episode and writes it as a film, or as a page that replays it in any browser.",
+        allow_abbrev=False,
+    )
+    render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help="a run folder")
+    render.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("replay.html"), metavar="FILE")
+    render.add_argument("--seed", metavar="K", help="whose policy, of the run's seeds (default: its first)")
+    render.add_argument("--episode", default="0", metavar="N", help="which of the fixed starts (default 0)")
+    render.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
+    render.add_argument(
+        "--steps", default=":", metavar="FROM:TO[:EVERY]", help="the control steps to show (default: all)"
+    )
+    render.add_argument("--fps", default="20", metavar="N", help="control steps shown a second (default 20)")
+    render.add_argument("--size", default="640x360", metavar="WxH", help="pixels of a film (default 640x360)")
+    render.set_defaults(run=_render)
+
+
+def _add_plot(commands: Any) -> None:
+    plot = commands.add_parser(
+        "plot",
+        help="draw the training curves of runs: pmt plot runs/* -o curves.png (or .svg, .pdf)",
+        description="Reward, cost, violations, multiplier and emotions over training; runs that differ in nothing but "
+        "their seeds make one curve: the mean over seeds, in a band from the lowest to the highest.",
+        allow_abbrev=False,
+    )
+    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    plot.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("curves.png"), metavar="FILE")
+    plot.set_defaults(run=_plot)
+
+
+def _add_report(commands: Any) -> None:
+    report = commands.add_parser(
+        "report",
+        help="everything about runs on one page: pmt report runs/* -o report.html",
+        description="Settings, versions, curves, an evaluation with intervals and a replay, in one file.",
+        allow_abbrev=False,
+    )
+    report.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    report.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("report.html"), metavar="FILE")
+    report.add_argument("--episodes", default="32", help="of the evaluation, per seed (default 32)")
+    report.set_defaults(run=_report)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -217,6 +266,52 @@ def _doctor(arguments: argparse.Namespace) -> int:
     from . import doctor
 
     return doctor.report(_say)
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    seed = None if arguments.seed is None else _whole("--seed", arguments.seed, 0)
+    number = _whole("--episode", arguments.episode, 0)
+    steps = [None if part == "" else _whole("--steps", part, 0) for part in arguments.steps.split(":")]
+    if len(steps) not in (2, 3) or steps[2:] == [0]:
+        raise UsageError(f"--steps must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{arguments.steps}'")
+    size = arguments.size.split("x")
+    if len(size) != 2:
+        raise UsageError(f"--size must be WIDTHxHEIGHT in pixels, like 640x360, not '{arguments.size}'")
+    width, height = (_whole("--size", part, 32) for part in size)
+    fps = _whole("--fps", arguments.fps, 1)
+    _quiet_xla()
+    from . import render
+
+    render.render(
+        arguments.run_folder,
+        arguments.out,
+        seed=seed,
+        number=number,
+        deterministic=arguments.deterministic,
+        moments=slice(*steps),
+        fps=fps,
+        size=(width, height),
+        say=_say,
+    )
+    return 0
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    from . import report
+
+    report.plot(arguments.run_folders, arguments.out)
+    _say(f"wrote {arguments.out}")
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    episodes = _whole("--episodes", arguments.episodes, 1)
+    _quiet_xla()
+    from . import report
+
+    report.report(arguments.run_folders, arguments.out, episodes, say=_say)
+    _say(f"wrote {arguments.out}")
+    return 0
 
 
 def _envs(arguments: argparse.Namespace) -> int:
