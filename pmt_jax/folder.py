@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import importlib.metadata
@@ -21,6 +20,7 @@ from . import learner
 from .checkpoint import Checkpoints
 from .config import Config, load_config, to_toml
 from .errors import UsageError
+from .files import read_rows, replace_text
 from .run import Run, setup
 from .tasks import did_you_mean
 from .types import Best, LearnerState
@@ -108,22 +108,6 @@ def write_settings(out: pathlib.Path, run: Run) -> None:
     """Writes config.toml and versions.json."""
     replace_text(out / "config.toml", to_toml(run.config))
     replace_text(out / "versions.json", json.dumps(versions(run), indent=2) + "\n")
-
-
-def replace_text(path: pathlib.Path, text: str) -> None:
-    """Writes a file whole or, where that fails, leaves the old one."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    partial.replace(path)
-
-
-def read_rows(metrics: pathlib.Path) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl, without one that was cut off in mid-line; none where there is no file."""
-    rows = []
-    for line in metrics.read_text().splitlines() if metrics.exists() else []:
-        with contextlib.suppress(json.JSONDecodeError):
-            rows.append(json.loads(line))
-    return rows
 
 
 def forget_rows_after(out: pathlib.Path, step: int, say: Say) -> float:

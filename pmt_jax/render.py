@@ -18,7 +18,7 @@ import numpy as np
 from . import feeder, page
 from .episode import Episode, record_run
 from .errors import UsageError, optional
-from .output import writing
+from .files import writing
 
 FORMATS = (".mp4", ".gif", ".html")
 SIZE = (640, 360)  # pixels

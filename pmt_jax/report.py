@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import html
 import io
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .errors import UsageError, optional
-from .output import writing
+from .files import read_rows, writing
 
 POINTS = 100  # of a curve
 PANELS = {
@@ -106,18 +105,12 @@ def _rows(folder: pathlib.Path) -> dict[tuple[int, int], dict[str, Any]]:
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a run folder: there is no such folder")
     try:
-        text = (folder / "metrics.jsonl").read_text(errors="replace")
+        rows = read_rows(folder / "metrics.jsonl", missing_ok=False)
     except OSError as error:
         raise UsageError(
             f"{folder} has no figures to draw: cannot read its metrics.jsonl ({error.strerror})"
         ) from error
-    rows = {}
-    for line in text.splitlines():
-        with contextlib.suppress(json.JSONDecodeError, AttributeError):
-            row = json.loads(line)
-            if IDENTITY <= row.keys():
-                rows[row["step"], row["seed"]] = row
-    return rows
+    return {(row["step"], row["seed"]): row for row in rows if IDENTITY <= row.keys()}
 
 
 def _number(x: Any) -> float:

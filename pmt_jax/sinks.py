@@ -25,7 +25,7 @@ from rich.table import Table
 
 from .config import Config
 from .errors import UsageError
-from .folder import read_rows
+from .files import read_rows
 from .tasks import did_you_mean
 
 Row = dict[str, Any]

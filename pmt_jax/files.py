@@ -1,0 +1,50 @@
+"""Files that are either whole or not there, and rows of figures that may not be."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from .errors import UsageError
+
+
+@contextlib.contextmanager
+def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A file beside `out` to write to, which takes the place of `out` when all has gone well.
+
+    Raises:
+      UsageError: the folder cannot be written.
+    """
+    partial = out.with_stem(f".{out.stem}.partial")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        partial.replace(out)
+    except OSError as error:
+        raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another -o") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def replace_text(path: pathlib.Path, text: str) -> None:
+    """Writes a file whole or, where that fails, leaves the old one."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def read_rows(metrics: pathlib.Path, missing_ok: bool = True) -> list[dict[str, Any]]:
+    """The rows of a metrics.jsonl, without lines that are no row, cut off in the middle for one.
+
+    Raises:
+      OSError: it cannot be read; where there is no file and `missing_ok`, there are no rows.
+    """
+    rows = []
+    for line in [] if missing_ok and not metrics.exists() else metrics.read_text(errors="replace").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            rows.append(json.loads(line))
+    return [row for row in rows if isinstance(row, dict)]
