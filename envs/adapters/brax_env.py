@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 from brax import envs as brax_envs
@@ -24,7 +27,8 @@ class BraxEnv(brax_envs.Env):
     def step(self, state: brax_envs.State, action: jax.Array) -> brax_envs.State:
         """One control step with the team's `action` [N * A]."""
         mask = jnp.asarray(self._env.spec.action_mask)
-        return state.replace(**self._view(self._env.step(state.pipeline_state, action.reshape(mask.shape) * mask)))
+        ours = cast(State, state.pipeline_state)
+        return dataclasses.replace(state, **self._view(self._env.step(ours, action.reshape(mask.shape) * mask)))
 
     @property
     def observation_size(self) -> int:
@@ -41,7 +45,7 @@ class BraxEnv(brax_envs.Env):
         """Our physics engine's name."""
         return self._env.engine
 
-    def _view(self, state: State) -> dict:
+    def _view(self, state: State) -> dict[str, Any]:
         """What brax reads of `state`; the whole of it is carried where brax carries its physics."""
         return {
             "pipeline_state": state,

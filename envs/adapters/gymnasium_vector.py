@@ -8,6 +8,7 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -31,7 +32,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._vector = VectorEnv(env, num_envs)
         self._reset, self._step = jax.jit(self._vector.reset), jax.jit(self._vector.step)
-        self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
+        self._np_random, self._np_random_seed = seeding.np_random(seed)
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pettingzoo
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 
 from ..base import Env
 from ..vector import VectorEnv
@@ -36,11 +36,11 @@ class PettingZooParallel(pettingzoo.ParallelEnv):
         self._state: Any = None
         self._global_state: Any = None
 
-    def observation_space(self, agent: str) -> Box:
+    def observation_space(self, agent: str) -> Space:
         """What `agent` sees: [O], always the same object."""
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
+    def action_space(self, agent: str) -> Space:
         """What `agent` can do: its own action entries, each in [-1, 1]; always the same object."""
         return self.action_spaces[agent]
 
