@@ -103,18 +103,19 @@ def test_brax_wrappers_accept_a_task_and_say_what_it_says():
     env = envs.make("lane")
     team = adapters.to_brax(env)
     assert (team.observation_size, team.action_size) == (16, 4)
-    wrapped = training.wrap(team, episode_length=HORIZON)
+    wrapped = training.EvalWrapper(training.wrap(team, episode_length=HORIZON))
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     first = state.obs
     step = jax.jit(wrapped.step)
-    plain = env.reset(jax.random.key(0))
+    plain, paid = env.reset(jax.random.key(0)), 0
     for _ in range(HORIZON):
         state = step(state, jnp.full((3, 4), 0.5))
         plain = env.step(plain, jnp.full((2, 2), 0.5))
         np.testing.assert_allclose(state.reward, plain.reward, rtol=1e-5)
-        np.testing.assert_allclose(state.metrics["cost"], plain.cost.mean())
+        paid += plain.cost.mean()
     assert state.done.all() and state.info["truncation"].all()
     np.testing.assert_array_equal(state.obs, first)  # brax has reset it
+    np.testing.assert_allclose(state.info["eval_metrics"].episode_metrics["cost"], paid)
     assert step(state, jnp.zeros((3, 4))).done.sum() == 0
 
 

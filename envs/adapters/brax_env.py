@@ -27,8 +27,9 @@ class BraxEnv(brax_envs.Env):
     def step(self, state: brax_envs.State, action: jax.Array) -> brax_envs.State:
         """One control step with the team's `action` [N * A]."""
         mask = jnp.asarray(self._env.spec.action_mask)
-        ours = cast(State, state.pipeline_state)
-        return dataclasses.replace(state, **self._view(self._env.step(ours, action.reshape(mask.shape) * mask)))
+        view = self._view(self._env.step(cast(State, state.pipeline_state), action.reshape(mask.shape) * mask))
+        view["metrics"] = {**state.metrics, **view["metrics"]}  # brax's wrappers add theirs and want them back
+        return dataclasses.replace(state, **view)
 
     @property
     def observation_size(self) -> int:
