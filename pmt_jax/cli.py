@@ -81,7 +81,11 @@ def _add_train(commands: Any) -> None:
         description="Trains on TASK, or as a TOML file says.",
         allow_abbrev=False,
     )
-    train.add_argument("source", metavar="TASK|CONFIG", help="a task's name (pmt envs lists them) or a TOML file")
+    train.add_argument(
+        "source",
+        metavar="TASK|CONFIG",
+        help="a task's name (pmt envs lists them), a TOML file, or a Python file with a task of your own: my_env.py",
+    )
     train.add_argument("--out", type=pathlib.Path, help="the run folder (default: runs/TASK-METHOD-TIME)")
     train.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     train.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")

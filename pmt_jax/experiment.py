@@ -55,7 +55,7 @@ def train(config: Config, out: pathlib.Path | None, resume: bool = False, cache:
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     run = setup(config)
-    out = out or pathlib.Path("runs") / f"{config.task}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = out or pathlib.Path("runs") / f"{run.vector.spec.name}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
     _open_folder(out, config, resume)
     _announce(run, out, say)
     with _compile_cache(cache) as hits:
@@ -233,7 +233,7 @@ def _rows(run: Run, updates: int, metrics: dict[str, np.ndarray]) -> list[dict[s
         row: dict[str, Any] = {
             "step": updates * config.batch_size,
             "seed": config.seed + i,
-            "task": config.task,
+            "task": run.vector.spec.name,
             "method": config.method,
             "cost_limit": run.cost_limit,
         }

@@ -22,8 +22,10 @@ __all__ = [
     "State",
     "VectorEnv",
     "VectorState",
+    "absolute",
     "baseline",
     "did_you_mean",
+    "is_file",
     "make",
     "names",
 ]
@@ -56,6 +58,24 @@ def names() -> list[str]:
     return _envs().names()
 
 
+def is_file(name: str) -> bool:
+    """Whether a task's name means a Python file of the user's (`my_env.py`, `my_env.py:Name`)."""
+    return _envs().user.is_file(name)
+
+
+def absolute(name: str) -> str:
+    """A task's name as it means the same from every folder: that of a file becomes a whole path.
+
+    Raises:
+      UsageError: there is no such file.
+    """
+    envs = _envs()
+    try:
+        return envs.user.absolute(name) if is_file(name) else name
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from None
+
+
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """The nearest of `choices` as '; did you mean ...?', or all of them where none is near."""
     return _envs().errors.did_you_mean(word, choices)
@@ -81,7 +101,7 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
     """Builds a task, with the engine asked for where it has one.
 
     Raises:
-      UsageError: unknown task or option, or an engine that cannot run here.
+      UsageError: unknown task or option, an engine that cannot run here, or a file that does not keep the contract.
     """
     envs = _envs()
     try:
