@@ -26,7 +26,7 @@ from .checkpoint import Checkpoints
 from .config import Config, load_config, to_toml
 from .errors import UsageError
 from .evaluation import evaluate, play
-from .run import Run, setup
+from .run import Lanes, Run, setup
 from .sinks import Jsonl, Progress, Sink, duration
 from .types import LearnerState, Metrics
 
@@ -39,13 +39,22 @@ Say = Callable[[str], None]
 Chunk = Callable[[LearnerState], tuple[LearnerState, Metrics]]
 
 
-def train(config: Config, out: pathlib.Path | None, resume: bool = False, cache: bool = True, say: Say = print) -> int:
+def train(
+    config: Config,
+    out: pathlib.Path | None,
+    resume: bool = False,
+    cache: bool = True,
+    say: Say = print,
+    lanes: Lanes | None = None,
+) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
     Args:
       out: the run folder; runs/TASK-METHOD-TIME if None. It must not hold another run unless `resume`.
       resume: continue the run in `out` from its last checkpoint, bit for bit.
       cache: keep compiled programs on disk for the next start.
+      lanes: settings and seeds of `config.seeds` lanes, in place of the config's; one whose loss stops being finite
+        does not stop the others.
 
     Returns:
       The exit code: 0 when finished, 130 when interrupted (all saved), 1 when a loss stopped being finite.
@@ -54,7 +63,7 @@ def train(config: Config, out: pathlib.Path | None, resume: bool = False, cache:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    run = setup(config)
+    run = dataclasses.replace(setup(config), lanes=lanes)
     out = out or pathlib.Path("runs") / f"{run.vector.spec.name}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
     _open_folder(out, config, resume)
     _announce(run, out, say)
@@ -170,16 +179,15 @@ def _compile_cache(enabled: bool) -> Iterator[list[str]]:
 
 def _compile(run: Run, cache_events: list[str], say: Say) -> tuple[LearnerState, Chunk]:
     """The first state of all seeds, and the compiled program that advances it by one chunk."""
-    config, hyper = run.config, run.hyper
     say("compiling ...")
     begin = time.monotonic()
-    keys = jax.vmap(jax.random.key)(jnp.arange(config.seed, config.seed + config.seeds))
-    state = jax.jit(jax.vmap(functools.partial(learner.init, run), (None, 0)))(hyper, keys)
+    hyper, keys, axes = run.side_by_side
+    state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
-        return learner.train_chunk(run, hyper, state, config.log_interval)
+        return learner.train_chunk(run, hyper, state, run.config.log_interval)
 
-    program = jax.jit(jax.vmap(chunk, (None, 0)), donate_argnums=1)
+    program = jax.jit(jax.vmap(chunk, axes), donate_argnums=1)
     lowered = program.lower(hyper, state)
     cache_events.clear()
     compiled = lowered.compile()
@@ -198,7 +206,7 @@ def _loop(run: Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkp
     sinks: list[Sink] = [Jsonl(out / "metrics.jsonl")]
     sinks.append(Progress(config.num_updates * config.batch_size, done * config.batch_size))
     saved = begin = time.monotonic()
-    command = f"pmt train {out / 'config.toml'} --out {out} --resume"
+    command = "the same command" if run.lanes else f"pmt train {out / 'config.toml'} --out {out} --resume"
     broken: str | None = None
     with _interruptible() as stop:
         while done < config.num_updates and not stop and broken is None:
@@ -208,7 +216,7 @@ def _loop(run: Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkp
             rows = [{**row, "seconds": round(time.monotonic() - begin, 3)} for row in rows]
             for sink in sinks:
                 sink.write(rows)
-            broken = _broken(rows)
+            broken = None if run.lanes else _broken(rows)
             if broken is None and time.monotonic() - saved > CHECKPOINT_SECONDS:
                 checkpoints.save(done, state)
                 saved = time.monotonic()
@@ -221,7 +229,7 @@ def _loop(run: Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkp
     if done < config.num_updates:
         say(f"interrupted after {done * config.batch_size:,} steps; saved. Continue with: {command}")
         return 130
-    say(f"done in {duration(time.monotonic() - begin)}; evaluate with: pmt eval {out}")
+    say(f"done in {duration(time.monotonic() - begin)}" + ("" if run.lanes else f"; evaluate with: pmt eval {out}"))
     return 0
 
 
