@@ -20,7 +20,7 @@ class Lanes:
     """What trains side by side in one program where it is more than the seeds of one run: a part of a sweep.
 
     Attributes:
-      hyper: every lane's own settings, leaves [L]; seed: [L] int32.
+      hyper: every lane's own settings, leaves [L], or [] where all share them; seed: [L] int32.
     """
 
     hyper: Hyper
@@ -63,7 +63,7 @@ class Run:
         keys = jax.vmap(jax.random.key)
         if self.lanes is None:
             return self.hyper, keys(jnp.arange(self.config.seed, self.config.seed + self.config.seeds)), (None, 0)
-        return self.lanes.hyper, keys(self.lanes.seed), (0, 0)
+        return self.lanes.hyper, keys(self.lanes.seed), (0 if jnp.ndim(self.lanes.hyper.clip) else None, 0)
 
 
 def setup(config: Config, env: tasks.Env | None = None) -> Run:

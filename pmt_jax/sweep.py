@@ -122,7 +122,7 @@ def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: exp
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
-    groups = list(_groups(missing, out))
+    groups = list(_groups(points, missing, out))
     for number, (folder, group) in enumerate(groups, 1):
         first = next(iter(group.values()))
         say(f"program {number} of {len(groups)}: {len(group)} point(s) x {first.seeds} seed(s) side by side")
@@ -144,13 +144,14 @@ def _finished(folder: pathlib.Path, config: Config) -> bool:
     return True
 
 
-def _groups(points: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
+def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
     """What trains together and where: groups begun earlier that are still wanted as they are, then new ones."""
-    left = dict(points)
+    left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
     for folder in begun:
-        group = {file.stem: load_config(file) for file in sorted((folder / "points").glob("*.toml"))}
-        if all(name in left and repr(left[name]) == repr(config) for name, config in group.items()):
+        files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
+        group = {file.stem: load_config(file) for file in files}
+        if group and all(repr(points.get(name)) == repr(config) for name, config in group.items()):
             left = {name: config for name, config in left.items() if name not in group}
             yield folder, group
     last = max((int(p.name.split("-")[1]) for p in begun), default=0)
@@ -173,10 +174,9 @@ def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: experime
     configs = list(group.values())
     seeds, run = configs[0].seeds, setup(configs[0])
     settings = [dataclasses.replace(run, config=config).hyper for config in configs]
-    lanes = Lanes(
-        hyper=jax.tree.map(lambda *each: jnp.repeat(jnp.stack(each), seeds), *settings),
-        seed=jnp.concatenate([jnp.arange(config.seed, config.seed + seeds) for config in configs]),
-    )
+    own = jax.tree.map(lambda *each: jnp.repeat(jnp.stack(each), seeds), *settings)
+    seed = jnp.concatenate([jnp.arange(config.seed, config.seed + seeds) for config in configs])
+    lanes = Lanes(own if len(group) > 1 else settings[0], seed)  # settings that are shared keep the last bits of a run
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     return experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes)
