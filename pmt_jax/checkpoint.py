@@ -83,4 +83,5 @@ class Checkpoints:
         return unpack(dict(self._manager.restore(update, args=ocp.args.StandardRestore())), like)
 
     def close(self) -> None:
+        """Lets go of the folder."""
         self._manager.close()

@@ -162,6 +162,7 @@ class Config(Hyper):
 
     @property
     def num_updates(self) -> int:
+        """Updates that cover `steps`, in whole chunks."""
         return self.num_chunks * self.log_interval
 
     def replace(self, **changes: Any) -> Config:

@@ -19,8 +19,13 @@ Row = dict[str, Any]
 class Sink(Protocol):
     """Gets a chunk's rows, one per seed, then is closed."""
 
-    def write(self, rows: list[Row]) -> None: ...
-    def close(self) -> None: ...
+    def write(self, rows: list[Row]) -> None:
+        """Takes a chunk's rows."""
+        ...
+
+    def close(self) -> None:
+        """Comes once, after the last rows."""
+        ...
 
 
 class Jsonl:
