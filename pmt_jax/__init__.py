@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .evaluation import evaluate
     from .learner import init, make_train, train_step
     from .methods import METHODS, Method
+    from .policy import load_policy
     from .run import setup
 
 __version__ = "0.1.0"
@@ -24,12 +25,24 @@ _PLACES = {
     "evaluate": "evaluation",
     "init": "learner",
     "load_config": "config",
+    "load_policy": "policy",
     "make_train": "learner",
     "setup": "run",
     "train_step": "learner",
 }
 
-__all__ = ["METHODS", "Config", "Method", "evaluate", "init", "load_config", "make_train", "setup", "train_step"]
+__all__ = [
+    "METHODS",
+    "Config",
+    "Method",
+    "evaluate",
+    "init",
+    "load_config",
+    "load_policy",
+    "make_train",
+    "setup",
+    "train_step",
+]
 
 
 def __getattr__(name: str) -> Any:

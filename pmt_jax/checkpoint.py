@@ -1,12 +1,17 @@
 """Learner states on disk: orbax's atomic steps holding one flat table {path: array}.
 
 Flat, because orbax refuses typed keys and empty leaves, and because partial loads of trees are silent: here the two
-sets of paths are compared, and a difference is a sentence.
+sets of paths are compared, and a difference is a sentence. A checksum stands in the table, because orbax hands back a
+flipped bit without a word.
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import pathlib
+import zlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -17,6 +22,7 @@ import orbax.checkpoint as ocp
 from .errors import UsageError
 
 KEEP = 2
+CHECKSUM = "crc32"
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -55,33 +61,93 @@ def _is_key(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
+def _checksum(packed: dict[str, np.ndarray]) -> np.ndarray:
+    crc = 0
+    for path in sorted(packed):
+        crc = zlib.crc32(np.ascontiguousarray(packed[path]).tobytes(), zlib.crc32(path.encode(), crc))
+    return np.asarray([crc], np.uint32)
+
+
 class Checkpoints:
-    """The checkpoints of a run folder, one per update, the last `KEEP` of them kept."""
+    """The checkpoints of a run folder, named by their step, the last `KEEP` of them kept."""
 
-    def __init__(self, folder: pathlib.Path) -> None:
-        options = ocp.CheckpointManagerOptions(max_to_keep=KEEP, create=True, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
+    def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
+        """Opens the checkpoints of `folder`; `read_only` changes nothing on disk, so that looking is always allowed."""
+        self._folder = (folder / "checkpoints").absolute()
+        with _quiet():
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=KEEP,
+                create=not read_only,
+                cleanup_tmp_directories=not read_only,  # what a kill in the middle of a save left behind
+                read_only=read_only,
+                enable_async_checkpointing=False,
+            )
+            self._manager = ocp.CheckpointManager(self._folder, options=options)
 
-    def save(self, update: int, state: Any) -> None:
-        """Writes `state` as the checkpoint after `update` updates; a crash meanwhile leaves the older ones whole."""
-        if update not in self._manager.all_steps():
-            self._manager.save(update, args=ocp.args.StandardSave(pack(state)))
+    def save(self, step: int, tree: Any) -> None:
+        """Writes `tree` as the checkpoint after `step` environment steps; a crash meanwhile leaves the older whole.
 
-    def latest(self) -> int | None:
-        """The newest complete checkpoint's update, None if there is none."""
-        return self._manager.latest_step()
+        Raises:
+          OSError: it could not be written (a full disk, a quota, a share that went away).
+        """
+        if step in self._manager.all_steps():
+            return
+        packed = pack(tree)
+        try:
+            with _quiet():
+                self._manager.save(step, args=ocp.args.StandardSave({**packed, CHECKSUM: _checksum(packed)}))
+        except ValueError as error:  # tensorstore's, whatever went wrong
+            raise OSError(_reason(error)) from error
 
-    def load(self, like: Any) -> Any:
-        """The newest checkpoint, in the structure of `like`.
+    def steps(self) -> list[int]:
+        """The steps of the complete checkpoints, newest first."""
+        return sorted(self._manager.all_steps(), reverse=True)
+
+    def load(self, like: Any, warn: Callable[[str], object]) -> tuple[int, Any]:
+        """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
+
+        Args:
+          warn: told of every newer one that is damaged.
 
         Raises:
           UsageError: there is none, or it belongs to another kind of run.
         """
-        update = self.latest()
-        if update is None:
-            raise UsageError(f"there is no finished checkpoint in {self._manager.directory}; train the run first")
-        return unpack(dict(self._manager.restore(update, args=ocp.args.StandardRestore())), like)
+        for step in self.steps():
+            try:
+                with _quiet():
+                    packed = dict(self._manager.restore(step, args=ocp.args.StandardRestore()))
+                stored = packed.pop(CHECKSUM, None)
+                if stored is not None and stored != _checksum({path: np.asarray(x) for path, x in packed.items()}):
+                    raise ValueError("its checksum does not fit")
+            except (ValueError, OSError) as error:
+                warn(f"the checkpoint after {step:,} steps in {self._folder} is damaged ({_reason(error)})")
+                continue
+            return step, unpack(packed, like)
+        if self.steps():
+            raise UsageError(f"every checkpoint in {self._folder} is damaged; restore one from a backup or train anew")
+        raise UsageError(f"there is no finished checkpoint in {self._folder}; train the run first")
+
+    def forget_after(self, step: int) -> None:
+        """Deletes the checkpoints of later steps, from which nobody could continue."""
+        for later in [s for s in self.steps() if s > step]:
+            self._manager.delete(later)
 
     def close(self) -> None:
         """Lets go of the folder."""
         self._manager.close()
+
+
+def _reason(error: Exception) -> str:
+    """The end of an error's first line: tensorstore begins with a page of paths."""
+    return str(error).split("\n")[0].split(": ")[-1].split(" [")[0]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Orbax logs every error with the tracebacks of all its threads; the caller gets the error, and one is enough."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)

@@ -1,4 +1,4 @@
-"""`pmt train | eval | sweep | table | reproduce | envs`: words into settings, nothing else."""
+"""`pmt train | eval | sweep | table | reproduce | export | doctor | envs`: words into settings, nothing else."""
 
 from __future__ import annotations
 
@@ -73,6 +73,9 @@ def _parser() -> tuple[_Parser, list[str]]:
     _add_sweep(commands)
     _add_table(commands)
     _add_reproduce(commands)
+    _add_export(commands)
+    doctor = commands.add_parser("doctor", help="what of this machine can be used, and why not the rest")
+    doctor.set_defaults(run=_doctor)
     envs = commands.add_parser("envs", help="list the tasks", allow_abbrev=False)
     envs.set_defaults(run=_envs)
     return parser, list(commands.choices)
@@ -93,6 +96,10 @@ def _add_train(commands: Any) -> None:
     train.add_argument("--out", type=pathlib.Path, help="the run folder (default: runs/TASK-METHOD-TIME)")
     train.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     train.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    train.add_argument(
+        "--sink", default="", metavar="NAMES", help="figures also go to csv, tensorboard, wandb (any, with commas)"
+    )
+    train.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="write a JAX profiler trace of a few chunks")
     _add_settings(train)
     train.set_defaults(run=_train)
 
@@ -131,6 +138,8 @@ def _add_eval(commands: Any) -> None:
     evaluation.add_argument("--env", action="append", default=[], metavar="NAME=VALUE", help="the task's own options")
     evaluation.add_argument("--episodes", default="32", help="episodes per seed (default 32)")
     evaluation.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
+    _add_which(evaluation)
+    evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
     evaluation.set_defaults(run=_eval)
 
 
@@ -194,6 +203,24 @@ def _add_format(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", default="text", metavar="WORD", help="text (default) | markdown | latex | json")
 
 
+def _add_export(commands: Any) -> None:
+    export = commands.add_parser(
+        "export",
+        help="write a trained policy as files: pmt export runs/x -o policy",
+        description="Writes policy.stablehlo (jax.export), policy.npz (weights) and numpy_policy.py (their loader).",
+        allow_abbrev=False,
+    )
+    export.add_argument("source", metavar="RUN", type=pathlib.Path, help="a run folder")
+    export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
+    export.add_argument("--seed", metavar="N", help="which of the run's seeds (default: its first)")
+    _add_which(export)
+    export.set_defaults(run=_export)
+
+
+def _add_which(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--which", default="last", metavar="WORD", help="which learner state: last (default) | best")
+
+
 def _train(arguments: argparse.Namespace) -> int:
     config = settings.load_config(arguments.source, preset=arguments.preset, **_given(arguments))
     if arguments.resume and arguments.out is None:
@@ -201,7 +228,15 @@ def _train(arguments: argparse.Namespace) -> int:
     _quiet_xla()
     from . import experiment
 
-    return experiment.train(config, arguments.out, arguments.resume, cache=not arguments.no_cache, say=_say)
+    return experiment.train(
+        config,
+        arguments.out,
+        arguments.resume,
+        cache=not arguments.no_cache,
+        sinks=[name for name in arguments.sink.split(",") if name],
+        profile=arguments.profile,
+        say=_say,
+    )
 
 
 def _say(line: str) -> None:
@@ -215,22 +250,22 @@ def _quiet_xla() -> None:
 
 
 def _eval(arguments: argparse.Namespace) -> int:
-    if not arguments.episodes.isdecimal() or int(arguments.episodes) < 1:
-        raise UsageError(f"--episodes must be a whole number of at least 1, not '{arguments.episodes}'")
+    episodes = _whole("--episodes", arguments.episodes, least=1)
     _quiet_xla()
     from . import experiment
 
-    episodes = int(arguments.episodes)
     if arguments.policy:
         options = dict(settings.convert("env", arguments.env))
         rows = [experiment.evaluate_baseline(arguments.source, arguments.policy, episodes, options)]
         how = f"policy {arguments.policy}"
     else:
-        rows = experiment.evaluate_run(pathlib.Path(arguments.source), episodes, arguments.deterministic)
-        how = "mean actions" if arguments.deterministic else "sampled actions"
+        source, physics = pathlib.Path(arguments.source), arguments.physics
+        rows = experiment.evaluate_run(source, episodes, arguments.deterministic, arguments.which, physics, say=_say)
+        how = f"{'mean' if arguments.deterministic else 'sampled'} actions of the {arguments.which} policy"
     print(f"{arguments.source}: {episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
     for row in rows:
-        print(f"seed {row.get('seed', '-')} (cost limit {row['cost_limit']:g} an episode)")
+        whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
+        print(f"{whose}(cost limit {row['cost_limit']:g} an episode)")
         for name, figures in row.items():
             if isinstance(figures, tuple):
                 print(f"  {name:24} {figures[0]:12.4f} +- {figures[1]:.4f}")
@@ -278,6 +313,30 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
     cache = not arguments.no_cache
     return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache=cache, say=_say)
+
+
+def _whole(flag: str, text: str, least: int) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise UsageError(f"{flag} must be a whole number of at least {least}, not '{text}'")
+    return int(text)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    seed = None if arguments.seed is None else _whole("--seed", arguments.seed, least=0)
+    _quiet_xla()
+    from .policy import export_policy
+
+    export_policy(arguments.source, arguments.out, seed, arguments.which)
+    print(f"wrote policy.stablehlo, policy.npz and numpy_policy.py into {arguments.out}")
+    return 0
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    del arguments
+    _quiet_xla()
+    from . import doctor
+
+    return doctor.report(_say)
 
 
 def _envs(arguments: argparse.Namespace) -> int:

@@ -118,6 +118,8 @@ class Config(Hyper):
       physics: which engine simulates; auto takes the fastest for the device.
       env: the task's own options, as name=value.
       log_interval: updates per row of metrics.jsonl.
+      eval_interval: updates between evaluations under mean actions, rounded up to whole rows; 0 for none.
+      eval_episodes: episodes per seed of such an evaluation.
     """
 
     task: str = "lane"
@@ -146,6 +148,8 @@ class Config(Hyper):
     physics: Literal["auto", "mjx", "warp", "mujoco"] = "auto"
     env: tuple[tuple[str, Any], ...] = ()
     log_interval: int = 1
+    eval_interval: int = 0
+    eval_episodes: int = 32
 
     def __post_init__(self) -> None:
         _validate(self)
@@ -346,10 +350,13 @@ def _toml(value: Any) -> str:
 
 
 def _validate(config: Config) -> None:
-    counts = ("steps", "seeds", "num_envs", "rollout_length", "epochs", "minibatches", "log_interval", "trust_steps")
+    counts = ("steps", "seeds", "num_envs", "rollout_length", "epochs", "minibatches")
+    counts += ("log_interval", "eval_episodes", "trust_steps")
     for name in counts:
         if getattr(config, name) < 1:
             raise UsageError(f"{name} must be at least 1, not {getattr(config, name)}")
+    if config.eval_interval < 0:
+        raise UsageError(f"eval_interval must be a number of updates, or 0 for none, not {config.eval_interval}")
     if config.seed < 0 or config.seed + config.seeds > 2**31:
         raise UsageError(f"seed must lie between 0 and 2**31 - seeds, not {config.seed}")
     if not config.hidden or min(config.hidden) < 1:

@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.special
 
 from . import tasks
 from .run import Run
@@ -76,3 +78,24 @@ def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
     (_, _, sums), _ = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
     per_step = [name for name in sums if not name.startswith("episode_")]
     return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}}
+
+
+def interval(x: np.ndarray) -> tuple[float, float]:
+    """Of independent figures [n]: the mean and the half-width of its 95 % interval (Student's t; nan for n = 1)."""
+    n = len(x)
+    if n == 1:
+        return float(x[0]), float("nan")
+    quantile = float(scipy.special.stdtrit(n - 1, 0.975))
+    return float(x.mean()), quantile * float(x.std(ddof=1)) / n**0.5
+
+
+def improves(
+    reward: np.ndarray, cost: np.ndarray, best_reward: np.ndarray, best_cost: np.ndarray, limit: float
+) -> np.ndarray:
+    """Whether a policy is better than the best so far: [...] bool, of mean episode rewards and costs [...].
+
+    Within the cost limit beats beyond it; within it the higher reward is better, beyond it the lower cost. Figures
+    that are nan (no episode ended) improve on nothing.
+    """
+    within, was_within = cost <= limit, best_cost <= limit
+    return np.where(within & was_within, reward > best_reward, np.where(was_within, False, cost < best_cost))

@@ -1,49 +1,43 @@
-"""The impure room: folders, clocks, signals, printing. Everything it calls is pure."""
+"""The impure room: clocks, signals, printing. What it calls is pure, but for the run folder, checkpoints and sinks."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import importlib.metadata
-import json
 import math
 import os
 import pathlib
-import platform
 import signal
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from . import learner, tasks
+from . import folder, tasks
 from .checkpoint import Checkpoints
-from .config import Config, load_config, to_toml
-from .errors import UsageError
-from .evaluation import evaluate, play
+from .compiling import Programs, compile_run, evaluate_seeds, use_cache
+from .config import Config
+from .evaluation import improves, interval, play
+from .folder import Say, load_run
 from .run import Lanes, Run, setup
-from .sinks import Jsonl, Progress, Sink, duration
-from .types import LearnerState, Metrics
+from .sinks import Profile, Sink, check_sinks, duration, open_sinks
+from .types import Best, LearnerState, Metrics
 
-PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 CHECKPOINT_SECONDS = 300.0
-MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 LOSSES = ("actor/loss", "critic/loss", "cost_critic/loss")
-
-Say = Callable[[str], None]
-Chunk = Callable[[LearnerState], tuple[LearnerState, Metrics]]
 
 
 def train(
     config: Config,
     out: pathlib.Path | None,
     resume: bool = False,
+    *,
     cache: bool = True,
+    sinks: Sequence[str] = (),
+    profile: pathlib.Path | None = None,
     say: Say = print,
     lanes: Lanes | None = None,
 ) -> int:
@@ -53,33 +47,76 @@ def train(
       out: the run folder; runs/TASK-METHOD-TIME if None. It must not hold another run unless `resume`.
       resume: continue the run in `out` from its last checkpoint, bit for bit.
       cache: keep compiled programs on disk for the next start.
+      sinks: where the figures go besides metrics.jsonl: csv, tensorboard, wandb.
+      profile: a folder for a JAX profiler trace of a few chunks.
       lanes: settings and seeds of `config.seeds` lanes, in place of the config's; one whose loss stops being finite
         does not stop the others.
 
     Returns:
-      The exit code: 0 when finished, 130 when interrupted (all saved), 1 when a loss stopped being finite.
+      The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a loss stopped
+      being finite or the folder could not be written any more.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
     """
-    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
+    jax.config.update("jax_default_matmul_precision", folder.MATMUL_PRECISION)
+    check_sinks(sinks)
     run = dataclasses.replace(setup(config), lanes=lanes)
     out = out or pathlib.Path("runs") / f"{run.vector.spec.name}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
-    _open_folder(out, config, resume)
+    folder.open_folder(out, run, resume, say)
     _announce(run, out, say)
-    with _compile_cache(cache) as hits:
-        state, chunk = _compile(run, hits, say)
-    checkpoints = Checkpoints(out)
+    if cache:
+        use_cache()
+    state, programs = compile_run(run, say)
+    start = _Position(state, folder.first_best(state))
+    command = "the same command" if lanes else f"pmt train {out / 'config.toml'} --out {out} --resume"
     try:
-        if resume and checkpoints.latest() is not None:
-            state = checkpoints.load(state)
-            step = int(state.update[0]) * config.batch_size
-            _forget_rows_after(out / "metrics.jsonl", step)
-            say(f"resuming after {step:,} steps")
-        _write_once(out, config)
-        return _loop(run, state, chunk, out, checkpoints, say)
-    finally:
-        checkpoints.close()
+        with contextlib.ExitStack() as stack:
+            checkpoints = stack.enter_context(contextlib.closing(Checkpoints(out)))
+            if resume:
+                start = _restore(start, checkpoints, out, say)
+            folder.write_settings(out, run)
+            opened = [
+                stack.enter_context(contextlib.closing(sink)) for sink in open_sinks(sinks, out, config, start.step)
+            ]
+            tracing = stack.enter_context(contextlib.closing(Profile(profile)))
+            end = _loop(run, programs, start, checkpoints, opened, tracing)
+    except BrokenPipeError:  # standard output's, not the folder's
+        raise
+    except OSError as error:
+        begun = (out / "config.toml").is_file()
+        next_step = f"continue: {command}" if begun else "train again into another --out"
+        say(
+            f"stopped: cannot write into {out}: {error.strerror or error}. What was saved is whole; make room and "
+            f"{next_step}"
+        )
+        return 1
+    return _farewell(end, run, out, command, say)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Position:
+    """Where training stands.
+
+    Attributes:
+      state, best: of all seeds.
+      step: environment steps done by each seed.
+      seconds: spent on them.
+      broken: why it cannot go on, if so.
+      signal: the one that interrupted it, if any.
+    """
+
+    state: LearnerState
+    best: Best
+    step: int = 0
+    seconds: float = 0.0
+    broken: str | None = None
+    signal: int | None = None
+
+    @property
+    def saved(self) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {"last": self.state, "best": self.best}
 
 
 def _announce(run: Run, out: pathlib.Path, say: Say) -> None:
@@ -94,152 +131,67 @@ def _announce(run: Run, out: pathlib.Path, say: Say) -> None:
     )
 
 
-def _open_folder(out: pathlib.Path, config: Config, resume: bool) -> None:
-    """Makes sure that `out` can be written and is either empty or the run to resume; writes nothing but the folder."""
-    existing = out / "config.toml"
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file, not a folder; choose another --out")
-    if resume:
-        if not existing.is_file():
-            raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
-        _same_run(load_config(existing), config, out)
-    elif out.is_dir() and any(out.iterdir()):
-        what = "another run" if existing.exists() else "other files"
-        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".pmt-write-test"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another --out") from None
+def _restore(start: _Position, checkpoints: Checkpoints, out: pathlib.Path, say: Say) -> _Position:
+    """The newest checkpoint's position, all later traces of the run deleted; `start` where there is none yet."""
+    step, saved = checkpoints.load(start.saved, say) if checkpoints.steps() else (0, start.saved)
+    checkpoints.forget_after(step)
+    seconds = folder.forget_rows_after(out, step, say)
+    say(f"resuming after {step:,} steps")
+    return _Position(saved["last"], saved["best"], step, seconds)
 
 
-def _same_run(old: Config, new: Config, out: pathlib.Path) -> None:
-    """Only `steps` may change when a run is continued."""
-    fields = [f.name for f in dataclasses.fields(Config) if f.name != "steps"]
-    changed = [f for f in fields if repr(getattr(old, f)) != repr(getattr(new, f))]
-    if changed:
-        listing = ", ".join(f"{f}: {getattr(old, f)!r} -> {getattr(new, f)!r}" for f in changed)
-        raise UsageError(f"the run in {out} was made with other settings ({listing}); resume it unchanged")
-
-
-def _write_once(out: pathlib.Path, config: Config) -> None:
-    (out / "config.toml").write_text(to_toml(config))
-    versions: dict[str, Any] = {name: _version(name) for name in PACKAGES}
-    versions |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
-    versions |= {"matmul_precision": MATMUL_PRECISION}
-    (out / "versions.json").write_text(json.dumps(versions, indent=2) + "\n")
-
-
-def _forget_rows_after(metrics: pathlib.Path, step: int) -> None:
-    """Drops what was logged after the checkpoint that the run continues from, and what was cut off in mid-line."""
-    if not metrics.exists():
-        return
-    kept = []
-    for line in metrics.read_text().splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
-            if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-    partial = metrics.with_suffix(".partial")
-    partial.write_text("".join(kept))
-    partial.replace(metrics)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Compiling
-
-
-@contextlib.contextmanager
-def _compile_cache(enabled: bool) -> Iterator[list[str]]:
-    """The persistent compile cache; yields the list that cache events are appended to."""
-    events: list[str] = []
-
-    def listen(event: str, **_: Any) -> None:
-        if event.startswith("/jax/compilation_cache/"):
-            events.append(event.rsplit("/", 1)[1])
-
-    if enabled and not getattr(jax.config, "jax_compilation_cache_dir", None):
-        home = pathlib.Path(os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache"))
-        jax.config.update("jax_compilation_cache_dir", str(home / "pmt-jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    jax.monitoring.register_event_listener(listen)
-    try:
-        yield events
-    finally:
-        jax.monitoring.unregister_event_listener(listen)
-
-
-def _compile(run: Run, cache_events: list[str], say: Say) -> tuple[LearnerState, Chunk]:
-    """The first state of all seeds, and the compiled program that advances it by one chunk."""
-    say("compiling ...")
-    begin = time.monotonic()
-    hyper, keys, axes = run.side_by_side
-    state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
-
-    def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
-        return learner.train_chunk(run, hyper, state, run.config.log_interval)
-
-    program = jax.jit(jax.vmap(chunk, axes), donate_argnums=1)
-    lowered = program.lower(hyper, state)
-    cache_events.clear()
-    compiled = lowered.compile()
-    found = "hit" if "cache_hits" in cache_events else "miss" if cache_events else "off"
-    say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found})")
-    return state, lambda state: compiled(hyper, state)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The loop
-
-
-def _loop(run: Run, state: LearnerState, chunk: Chunk, out: pathlib.Path, checkpoints: Checkpoints, say: Say) -> int:
-    config = run.config
-    done = int(state.update[0])
-    sinks: list[Sink] = [Jsonl(out / "metrics.jsonl")]
-    sinks.append(Progress(config.num_updates * config.batch_size, done * config.batch_size))
-    saved = begin = time.monotonic()
-    command = "the same command" if run.lanes else f"pmt train {out / 'config.toml'} --out {out} --resume"
-    broken: str | None = None
-    with _interruptible() as stop:
-        while done < config.num_updates and not stop and broken is None:
-            state, metrics = chunk(state)
-            done += config.log_interval
-            rows = _rows(run, done, jax.device_get(metrics))
-            rows = [{**row, "seconds": round(time.monotonic() - begin, 3)} for row in rows]
-            for sink in sinks:
-                sink.write(rows)
+def _loop(
+    run: Run, programs: Programs, start: _Position, checkpoints: Checkpoints, sinks: list[Sink], tracing: Profile
+) -> _Position:
+    """Trains until done, interrupted or broken, and saves the end unless it is broken."""
+    config, now = run.config, start
+    begin = saved = time.monotonic()
+    with _interruptible() as received:
+        while now.step < config.num_updates * config.batch_size and not received:
+            tracing.before_chunk()
+            state, metrics = programs.chunk(now.state)
+            step = now.step + config.log_interval * config.batch_size
+            rows = _rows(run, step, jax.device_get(metrics))
             broken = None if run.lanes else _broken(rows)
-            if broken is None and time.monotonic() - saved > CHECKPOINT_SECONDS:
-                checkpoints.save(done, state)
+            rows = _with_evaluation(run, programs, state, rows, skip=broken is not None)
+            seconds = start.seconds + time.monotonic() - begin
+            for sink in sinks:
+                sink.write([{**row, "seconds": round(seconds, 3)} for row in rows])
+            best = now.best if broken else _keep_best(run, programs, now.best, state, rows)
+            now = _Position(state, best, step, seconds, broken)
+            if broken:
+                return now
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                checkpoints.save(step, now.saved)
                 saved = time.monotonic()
-        for sink in sinks:
-            sink.close()
-        if broken is not None:
-            say(f"stopped: {broken}; the last checkpoint and all figures are in {out}. Try a smaller learning rate.")
-            return 1
-        checkpoints.save(done, state)
-    if done < config.num_updates:
-        say(f"interrupted after {done * config.batch_size:,} steps; saved. Continue with: {command}")
-        return 130
-    say(f"done in {duration(time.monotonic() - begin)}" + ("" if run.lanes else f"; evaluate with: pmt eval {out}"))
+        checkpoints.save(now.step, now.saved)
+    return dataclasses.replace(now, signal=received[0] if received else None)
+
+
+def _farewell(end: _Position, run: Run, out: pathlib.Path, command: str, say: Say) -> int:
+    """Says how training ended and what to do next; returns the exit code."""
+    if end.broken is not None:
+        say(f"stopped: {end.broken}; all figures are in {out}. Try a smaller learning rate with another --out.")
+        return 1
+    if end.step < run.config.num_updates * run.config.batch_size:
+        say(f"interrupted after {end.step:,} steps; saved. Continue with: {command}")
+        return 128 + (end.signal or signal.SIGINT)
+    next_step = "" if run.lanes else f"; evaluate with: pmt eval {out}"
+    say(f"done: {end.step:,} steps in {duration(end.seconds)}{next_step}")
     return 0
 
 
-def _rows(run: Run, updates: int, metrics: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+# ---------------------------------------------------------------------------------------------------------------------
+# Rows of figures
+
+
+def _rows(run: Run, step: int, metrics: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """A chunk's metrics as one row per seed: counts are summed over the chunk, the rest averaged, nan left out."""
     config = run.config
     rows = []
     for i in range(config.seeds):
         row: dict[str, Any] = {
-            "step": updates * config.batch_size,
+            "step": step,
             "seed": config.seed + i,
             "task": run.vector.spec.name,
             "method": config.method,
@@ -272,6 +224,48 @@ def _broken(rows: list[dict[str, Any]]) -> str | None:
     return None
 
 
+def _with_evaluation(
+    run: Run, programs: Programs, state: LearnerState, rows: list[dict[str, Any]], skip: bool
+) -> list[dict[str, Any]]:
+    """The rows with `eval/NAME` and its interval's half-width `eval/NAME/ci95`: nan where no evaluation is due."""
+    if programs.evaluate is None:
+        return rows
+    updates = rows[0]["step"] // run.config.batch_size
+    if skip or updates % run.config.eval_interval >= run.config.log_interval:
+        results = [dict.fromkeys(programs.evaluate.out_info, (math.nan, math.nan)) for _ in rows]
+    else:
+        results = _intervals(jax.device_get(programs.evaluate(state)))
+    return [
+        row
+        | {f"eval/{name}": mean for name, (mean, _) in result.items()}
+        | {f"eval/{name}/ci95": half for name, (_, half) in result.items()}
+        for row, result in zip(rows, results, strict=True)
+    ]
+
+
+def _intervals(results: Metrics) -> list[dict[str, tuple[float, float]]]:
+    """Of figures [seeds, episodes]: each seed's means and half-widths of their 95 % intervals."""
+    seeds = len(next(iter(results.values())))
+    return [{name: interval(np.asarray(x[i])) for name, x in results.items()} for i in range(seeds)]
+
+
+def _keep_best(run: Run, programs: Programs, best: Best, state: LearnerState, rows: list[dict[str, Any]]) -> Best:
+    """The best of `best` and `state`, seed by seed: judged by the evaluation if there is one, else by training."""
+    prefix = "eval/" if run.config.eval_interval else ""
+    reward, cost = (
+        np.asarray([row[prefix + f] for row in rows], np.float32) for f in ("episode_reward", "episode_cost")
+    )
+    old_reward, old_cost = np.asarray(best.reward), np.asarray(best.cost)
+    improved = improves(reward, cost, old_reward, old_cost, run.cost_limit)
+    if not improved.any():
+        return best
+    return Best(
+        programs.take(improved, best.state, state),
+        np.where(improved, reward, old_reward),
+        np.where(improved, cost, old_cost),
+    )
+
+
 @contextlib.contextmanager
 def _interruptible() -> Iterator[list[int]]:
     """Ctrl-C and SIGTERM end the loop after the running chunk; a second Ctrl-C kills the program at once."""
@@ -296,37 +290,33 @@ def _interruptible() -> Iterator[list[int]]:
 # Evaluation of a finished run
 
 
-def load_run(folder: pathlib.Path) -> tuple[Run, LearnerState]:
-    """A run's settings and its newest learner state, with a leading [seeds].
+def evaluate_run(
+    out: pathlib.Path,
+    episodes: int,
+    deterministic: bool,
+    which: str = "last",
+    physics: str | None = None,
+    say: Say = print,
+) -> list[dict[str, Any]]:
+    """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
 
-    Raises:
-      UsageError: the folder holds no run, or no checkpoint.
+    Args:
+      out: the run folder, which is only read.
+      deterministic: take mean actions instead of samples.
+      which: `last` or `best`.
+      physics: an engine other than the run's.
     """
-    if not (folder / "config.toml").is_file():
-        raise UsageError(f"{folder} is not a run folder: it has no config.toml")
-    run = setup(load_config(folder / "config.toml"))
-    keys = jax.vmap(jax.random.key)(jnp.arange(run.config.seeds))
-    like = jax.eval_shape(jax.vmap(functools.partial(learner.init, run), (None, 0)), run.hyper, keys)
-    checkpoints = Checkpoints(folder)
-    try:
-        return run, checkpoints.load(like)
-    finally:
-        checkpoints.close()
-
-
-def evaluate_run(folder: pathlib.Path, episodes: int, deterministic: bool) -> list[dict[str, Any]]:
-    """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval."""
-    run, state = load_run(folder)
-    program = jax.jit(jax.vmap(lambda s: evaluate(run, s, episodes, deterministic=deterministic)))
-    results = jax.device_get(program(state))
+    jax.config.update("jax_default_matmul_precision", folder.MATMUL_PRECISION)
+    run, state = load_run(out, which, physics, say)
+    results = jax.device_get(jax.jit(evaluate_seeds(run, episodes, deterministic))(state))
     return [
-        {
-            "seed": run.config.seed + i,
-            "cost_limit": run.cost_limit,
-            **_intervals({name: x[i] for name, x in results.items()}),
-        }
-        for i in range(run.config.seeds)
+        {"seed": run.config.seed + i, "cost_limit": run.cost_limit, "step": step, **figures}
+        for i, (figures, step) in enumerate(zip(_intervals(results), _steps(run, state), strict=True))
     ]
+
+
+def _steps(run: Run, state: LearnerState) -> list[int]:
+    return [int(update) * run.config.batch_size for update in state.update]
 
 
 def evaluate_baseline(task: str, policy: str, episodes: int, options: dict[str, Any]) -> dict[str, Any]:
@@ -338,13 +328,4 @@ def evaluate_baseline(task: str, policy: str, episodes: int, options: dict[str, 
     env = tasks.make(task, **options)
     act = jax.vmap(tasks.baseline(env, policy))
     results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes))())
-    return {"cost_limit": env.spec.cost_limit, **_intervals(results)}
-
-
-def _intervals(results: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    """Of figures [episodes]: the mean and the half-width of its 95 % interval."""
-
-    def interval(x: np.ndarray) -> tuple[float, float]:
-        return float(x.mean()), 1.96 * float(x.std(ddof=min(1, len(x) - 1))) / math.sqrt(len(x))
-
-    return {name: interval(x) for name, x in results.items()}
+    return {"cost_limit": env.spec.cost_limit, **{name: interval(x) for name, x in results.items()}}

@@ -108,6 +108,20 @@ class Networks:
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])), params)
         return jax.vmap(self.policy, in_axes=(0, -2), out_axes=(-2, 0))(params, obs)
 
+    def layers(self, params: Params) -> dict[str, jax.Array]:
+        """The mean's weights under plain names, for every layer i and with a leading [N].
+
+        kernel_i [N, I, J] and bias_i [N, J]; norm_scale_i and norm_bias_i [N, I] where layer i's input is normalised.
+        """
+        trunk = params["params"]["trunk"]
+        first = 0 if self.actor.trunk.input_norm else 1  # the first layer whose input may be normalised
+        named = {}
+        for i in range(len(self.actor.trunk.hidden) + 1):
+            dense, norm = trunk[f"Dense_{i}"], trunk.get(f"LayerNorm_{i - first}", {})
+            named |= {f"{name}_{i}": x for name, x in dense.items()}
+            named |= {f"norm_{name}_{i}": x for name, x in norm.items()}
+        return {name: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])) for name, x in named.items()}
+
     def value(self, params: Params, state: jax.Array) -> jax.Array:
         """V in normalised units: state [..., S] -> [...]."""
         return _apply(self.critic, params, state)[..., 0]

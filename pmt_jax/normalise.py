@@ -29,10 +29,21 @@ def accumulate(moments: Moments, x: jax.Array) -> Moments:
     return Moments(mean, (1 - share) * moments.second + share * rows.var(0) + between, weight)
 
 
+def obs_scaling(moments: Moments) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean, scale and bound of observations: x becomes clip((x - mean) / scale, -bound, bound).
+
+    While nothing has been seen these are 0, 1 and inf: the identity.
+    """
+    seen = moments.weight > 0
+    scale = jnp.sqrt(jnp.maximum(moments.second, MIN_OBS_VARIANCE))
+    # Not `mean * seen`: where the moments are constants, jax.export 0.9.2 takes a true for 255.
+    return jnp.where(seen, moments.mean, 0.0), jnp.where(seen, scale, 1.0), jnp.where(seen, OBS_CLIP, jnp.inf)
+
+
 def normalise_obs(moments: Moments, x: jax.Array) -> jax.Array:
     """`x` [..., *shape] centred, scaled and clipped to +-10; unchanged while nothing has been seen."""
-    scale = jnp.sqrt(jnp.maximum(moments.second, MIN_OBS_VARIANCE))
-    return jnp.where(moments.weight > 0, jnp.clip((x - moments.mean) / scale, -OBS_CLIP, OBS_CLIP), x)
+    mean, scale, bound = obs_scaling(moments)
+    return jnp.clip((x - mean) / scale, -bound, bound)
 
 
 def forget(moments: Moments, x: jax.Array, decay: jax.Array | float) -> Moments:

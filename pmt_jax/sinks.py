@@ -1,19 +1,57 @@
-"""Where a run's figures go: metrics.jsonl always, a live table on a terminal, plain lines elsewhere."""
+"""Where a run's figures go: metrics.jsonl and the terminal always; CSV, TensorBoard and Weights & Biases when asked.
+
+What is optional is imported when it is opened.
+"""
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import importlib
+import importlib.util
 import json
 import math
 import pathlib
 import sys
 import time
+import uuid
+from collections.abc import Sequence
 from typing import Any, Protocol
 
+import jax
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from .config import Config
+from .errors import UsageError
+from .folder import read_rows
+from .tasks import did_you_mean
+
 Row = dict[str, Any]
+NEEDS = {"csv": None, "tensorboard": "tensorboardX", "wandb": "wandb"}  # the packages of the optional sinks
+
+
+def check_sinks(names: Sequence[str]) -> None:
+    """Whether the optional sinks exist and their packages are installed.
+
+    Raises:
+      UsageError: one is unknown, or needs a package that is missing.
+    """
+    for name in names:
+        if name not in NEEDS:
+            raise UsageError(f"unknown sink '{name}'{did_you_mean(name, NEEDS)}")
+        package = NEEDS[name]
+        if package and importlib.util.find_spec(package) is None:
+            raise UsageError(f"sink '{name}' needs {package}; install it with pip install 'pmt-jax[log]'")
+
+
+def open_sinks(names: Sequence[str], out: pathlib.Path, config: Config, step: int) -> list[Sink]:
+    """All sinks of a run that goes on after `step` steps; metrics.jsonl holds the rows up to there."""
+    optional = {"csv": Csv, "tensorboard": TensorBoard, "wandb": Wandb}
+    others = [optional[name](out, config, step) for name in dict.fromkeys(names)]
+    progress = Progress(config.num_updates * config.batch_size, step)
+    return [Jsonl(out / "metrics.jsonl"), *others, progress]
 
 
 class Sink(Protocol):
@@ -41,6 +79,101 @@ class Jsonl:
 
     def close(self) -> None:
         self._file.close()
+
+
+class Csv:
+    """metrics.csv: the rows of metrics.jsonl with a header; what is not finite stays empty."""
+
+    def __init__(self, out: pathlib.Path, config: Config, step: int) -> None:
+        del config, step
+        self._file = (out / "metrics.csv").open("w", newline="")
+        self._writer: csv.DictWriter[str] | None = None
+        self.write(read_rows(out / "metrics.jsonl"))
+
+    def write(self, rows: list[Row]) -> None:
+        if rows and self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(rows[0]), extrasaction="ignore")
+            self._writer.writeheader()
+        if self._writer:
+            self._writer.writerows([finite(row) for row in rows])
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _numbers(row: Row) -> dict[str, float]:
+    """The figures of a row that a curve can be drawn of."""
+    known = {name: x for name, x in row.items() if isinstance(x, int | float) and math.isfinite(x)}
+    return {name: x for name, x in known.items() if name not in ("step", "seed")}
+
+
+class TensorBoard:
+    """Event files in tensorboard/seedN, over environment steps."""
+
+    def __init__(self, out: pathlib.Path, config: Config, step: int) -> None:
+        tensorboard = importlib.import_module("tensorboardX")
+        self._writers = {
+            seed: tensorboard.SummaryWriter(str(out / "tensorboard" / f"seed{seed}"), purge_step=step + 1)
+            for seed in range(config.seed, config.seed + config.seeds)
+        }
+
+    def write(self, rows: list[Row]) -> None:
+        for row in rows:
+            for name, x in _numbers(row).items():
+                self._writers[row["seed"]].add_scalar(name, x, row["step"])
+
+    def close(self) -> None:
+        for writer in self._writers.values():
+            writer.close()
+
+
+class Wandb:
+    """One Weights & Biases run in project pmt-jax, figures as seedN/NAME over environment steps.
+
+    Its id stands in the run folder, so that a resumed run continues it. WANDB_MODE=offline needs no network.
+    """
+
+    def __init__(self, out: pathlib.Path, config: Config, step: int) -> None:
+        del step
+        wandb = importlib.import_module("wandb")
+        place = out / "wandb-id"
+        if not place.exists():
+            place.write_text(uuid.uuid4().hex[:12])
+        settings = dataclasses.asdict(config)
+        self._run = wandb.init(
+            project="pmt-jax", name=out.name, id=place.read_text(), resume="allow", dir=str(out), config=settings
+        )
+
+    def write(self, rows: list[Row]) -> None:
+        figures = {f"seed{row['seed']}/{name}": x for row in rows for name, x in _numbers(row).items()}
+        self._run.log(figures, step=rows[0]["step"])
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class Profile:
+    """A JAX profiler trace of a few chunks, the first left out, in which everything still warms up."""
+
+    FIRST, END = 1, 4
+
+    def __init__(self, folder: pathlib.Path | None) -> None:
+        self._folder, self._chunks, self._running = folder, 0, False
+
+    def before_chunk(self) -> None:
+        """Starts or stops the trace where it is time to."""
+        if self._folder is not None and self._chunks == self.FIRST:
+            jax.profiler.start_trace(str(self._folder))
+            self._running = True
+        elif self._chunks == self.END:
+            self.close()
+        self._chunks += 1
+
+    def close(self) -> None:
+        if self._running:
+            self._running = False
+            jax.profiler.stop_trace()
 
 
 def finite(value: Any) -> Any:

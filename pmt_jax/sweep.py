@@ -22,6 +22,7 @@ from . import experiment, table
 from .checkpoint import Checkpoints
 from .config import HYPER_FIELDS, Config, load_config, to_toml
 from .errors import UsageError
+from .folder import Say, load_saved, read_rows
 from .methods import METHODS
 from .run import Lanes, setup
 from .tasks import did_you_mean, names
@@ -62,7 +63,7 @@ def _word(value: str) -> str:
         return re.sub(r"[^\w.=,+-]", "-", value)
 
 
-def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: experiment.Say = print) -> int:
+def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
     """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
     code = train_points(points, out, cache, say)
     if code == 0:
@@ -72,7 +73,7 @@ def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: experiment
 
 
 def reproduce(
-    name: str, budget: str, out: pathlib.Path, form: str = "text", cache: bool = True, say: experiment.Say = print
+    name: str, budget: str, out: pathlib.Path, form: str = "text", cache: bool = True, say: Say = print
 ) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
 
@@ -108,7 +109,7 @@ def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
     return grid(task, {"method": methods}, **{**budget, "steps": steps[task] if isinstance(steps, dict) else steps})
 
 
-def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: experiment.Say = print) -> int:
+def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
     """Trains what is missing of `points`, each into its own folder under `out`.
 
     Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
@@ -163,7 +164,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: experiment.Say) -> int:
+def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say) -> int:
     """Trains the points of one program side by side, or goes on with it."""
     try:
         (folder / "points").mkdir(parents=True, exist_ok=True)
@@ -184,8 +185,8 @@ def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: experime
 
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
-    run, state = experiment.load_run(folder / "run")
-    rows = [json.loads(line) for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
+    _, step, saved = load_saved(folder / "run")
+    rows = read_rows(folder / "run" / "metrics.jsonl")
     for number, (name, config) in enumerate(group.items()):
         if (out / name).exists():
             continue
@@ -200,7 +201,7 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in mine))
         shutil.copy(folder / "run" / "versions.json", part)
         checkpoints = Checkpoints(part)
-        checkpoints.save(int(state.update[0]), jax.tree.map(lambda x: x[first : first + config.seeds], state))  # noqa: B023
+        checkpoints.save(step, jax.tree.map(lambda x: x[first : first + config.seeds], saved))  # noqa: B023
         checkpoints.close()
         part.rename(out / name)
     shutil.rmtree(folder)

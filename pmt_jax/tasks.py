@@ -25,6 +25,7 @@ __all__ = [
     "absolute",
     "baseline",
     "did_you_mean",
+    "engines",
     "is_file",
     "make",
     "names",
@@ -95,6 +96,20 @@ def baseline(env: Env, name: str) -> Callable[[State], jax.Array]:
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
     return known[name](env)
+
+
+def engines() -> tuple[str, dict[str, str | None]]:
+    """The physics engine that `auto` takes here, and for each engine why it cannot run here, None where it can.
+
+    Raises:
+      UsageError: MuJoCo is missing or of another version.
+    """
+    package = _envs()
+    try:
+        physics = importlib.import_module(f"{package.__name__}.physics")
+        return physics.resolve("auto"), physics.explain()
+    except package.TaskError as error:
+        raise UsageError(str(error)) from error
 
 
 def make(name: str, physics: str = "auto", **options: Any) -> Env:

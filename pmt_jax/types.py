@@ -11,6 +11,7 @@ import typing
 from typing import Any
 
 import jax
+import numpy as np
 
 from .config import HYPER_FIELDS, Hyper
 from .tasks import VectorState
@@ -173,6 +174,20 @@ class LearnerState:
     rollout: RolloutState
     key: jax.Array
     update: jax.Array
+
+
+@pytree
+class Best:
+    """Each seed's best learner state so far and the figures it was chosen by, with a leading [seeds].
+
+    Attributes:
+      state: the learner state.
+      reward, cost: [seeds] f32, mean episode reward and cost; -inf and inf where nothing is known yet.
+    """
+
+    state: LearnerState
+    reward: np.ndarray
+    cost: np.ndarray
 
 
 Metrics = dict[str, jax.Array]

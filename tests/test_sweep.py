@@ -13,6 +13,7 @@ import pytest
 from pmt_jax import checkpoint, experiment, load_config, sweep, table
 from pmt_jax.config import to_toml
 from pmt_jax.errors import UsageError
+from pmt_jax.sinks import Jsonl
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
 TINY += ("--epochs", 1, "--method", "happo", "--seeds", 2, "--steps", 600)
@@ -78,14 +79,14 @@ def test_the_same_command_again_trains_nothing_and_shows_the_points_best_first(s
 
 
 def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
-    write = experiment.Jsonl.write
+    write = Jsonl.write
 
-    def interrupt(sink: experiment.Jsonl, log: list[dict]) -> None:
+    def interrupt(sink: Jsonl, log: list[dict]) -> None:
         write(sink, log)
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.Jsonl, "write", interrupt)
+        patch.setattr(Jsonl, "write", interrupt)
         code, out, _ = cli(*COMMAND, tmp_path)
     assert code == 130 and "Continue with: the same command" in out
     assert [p.name for p in tmp_path.iterdir()] == [".group-1"]

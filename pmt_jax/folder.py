@@ -1,0 +1,194 @@
+"""A run folder: what may be written into it, what is in it, and whether a run may go on there."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import importlib.metadata
+import json
+import pathlib
+import platform
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import learner
+from .checkpoint import Checkpoints
+from .config import Config, load_config, to_toml
+from .errors import UsageError
+from .run import Run, setup
+from .tasks import did_you_mean
+from .types import Best, LearnerState
+
+PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
+WHICH = ("last", "best")
+
+Say = Callable[[str], None]
+
+
+def open_folder(out: pathlib.Path, run: Run, resume: bool, say: Say) -> None:
+    """Makes sure that `out` can be written and is either empty or the run to resume; writes nothing but the folder.
+
+    Raises:
+      UsageError: it is not, or the run was made with other settings or another physics engine.
+    """
+    existing = out / "config.toml"
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file, not a folder; choose another --out")
+    if resume:
+        if not existing.is_file():
+            raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
+        _same_settings(load_config(existing), run.config, out)
+        _same_machine(out, run, say)
+    elif out.is_dir() and any(out.iterdir()):
+        what = "another run" if existing.exists() else "other files"
+        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".pmt-write-test"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another --out") from None
+
+
+def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
+    """Only `steps` may change when a run is continued."""
+    fields = [f.name for f in dataclasses.fields(Config) if f.name != "steps"]
+    changed = [f for f in fields if repr(getattr(old, f)) != repr(getattr(new, f))]
+    if changed:
+        difference = "".join(f"\n  {f}: {getattr(old, f)!r} -> {getattr(new, f)!r}" for f in changed)
+        raise UsageError(
+            f"the run in {out} was made with other settings; resume it unchanged (only --steps may grow), or choose "
+            f"another --out:{difference}"
+        )
+
+
+def _same_machine(out: pathlib.Path, run: Run, say: Say) -> None:
+    """Another engine computes another run; another device or version only loses the last bits, which is said."""
+    try:
+        old = json.loads((out / "versions.json").read_text())
+    except (OSError, ValueError):
+        say(f"{out / 'versions.json'} cannot be read: nobody can tell whether the run began with the same engine")
+        return
+    new = versions(run)
+    if old.get("engine", new["engine"]) != new["engine"]:
+        raise UsageError(
+            f"the run in {out} was simulated by engine '{old['engine']}', but physics = {run.config.physics} means "
+            f"'{new['engine']}' on this {new['device']}, whose numbers differ; resume it where '{old['engine']}' runs, "
+            "or choose another --out"
+        )
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    if changed:
+        say(f"since the run began there changed: {', '.join(changed)}; it goes on, but perhaps not bit for bit")
+
+
+def versions(run: Run) -> dict[str, Any]:
+    """What the numbers of a run depend on besides its settings."""
+    found: dict[str, Any] = {name: version(name) for name in PACKAGES}
+    found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    return found | {"engine": run.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
+
+
+def version(package: str) -> str | None:
+    """A package's version, None where it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def write_settings(out: pathlib.Path, run: Run) -> None:
+    """Writes config.toml and versions.json."""
+    replace_text(out / "config.toml", to_toml(run.config))
+    replace_text(out / "versions.json", json.dumps(versions(run), indent=2) + "\n")
+
+
+def replace_text(path: pathlib.Path, text: str) -> None:
+    """Writes a file whole or, where that fails, leaves the old one."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def read_rows(metrics: pathlib.Path) -> list[dict[str, Any]]:
+    """The rows of a metrics.jsonl, without one that was cut off in mid-line; none where there is no file."""
+    rows = []
+    for line in metrics.read_text().splitlines() if metrics.exists() else []:
+        with contextlib.suppress(json.JSONDecodeError):
+            rows.append(json.loads(line))
+    return rows
+
+
+def forget_rows_after(out: pathlib.Path, step: int, say: Say) -> float:
+    """Drops what was logged after the checkpoint that the run continues from, and what was cut off in mid-line.
+
+    Returns:
+      the seconds of training that the rows kept tell of.
+    """
+    metrics = out / "metrics.jsonl"
+    kept = [row for row in read_rows(metrics) if row["step"] <= step]
+    last, seconds = (kept[-1]["step"], kept[-1]["seconds"]) if kept else (0, 0.0)
+    if last < step:
+        say(f"{metrics} ends at step {last:,}, but the checkpoint is of step {step:,}: the rows between are lost")
+    if metrics.exists():
+        replace_text(metrics, "".join(json.dumps(row) + "\n" for row in kept))
+    return seconds
+
+
+def first_best(state: LearnerState) -> Best:
+    """Before anything is known of a run of any number of seeds."""
+    nothing = np.full(state.update.shape, np.inf, np.float32)
+    return Best(jax.tree.map(jnp.copy, state), -nothing, nothing)
+
+
+def load_run(
+    folder: pathlib.Path,
+    which: str = "last",
+    physics: str | None = None,
+    warn: Callable[[str], object] = warnings.warn,
+) -> tuple[Run, LearnerState]:
+    """A run's settings and a learner state of it, with a leading [seeds].
+
+    Args:
+      which: `last`, or `best`: each seed's own best (see docs/runs.md).
+      physics: an engine other than the run's.
+      warn: told of damaged checkpoints, which are passed over.
+
+    Raises:
+      UsageError: the folder holds no run, or no checkpoint.
+    """
+    if which not in WHICH:
+        raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
+    run, _, saved = load_saved(folder, physics, warn)
+    return run, saved["last"] if which == "last" else saved["best"].state
+
+
+def load_saved(
+    folder: pathlib.Path, physics: str | None = None, warn: Callable[[str], object] = warnings.warn
+) -> tuple[Run, int, dict[str, Any]]:
+    """A run's settings, the step of its newest whole checkpoint, and all that it holds: `last` and `best`.
+
+    Raises:
+      UsageError: the folder holds no run, or no checkpoint.
+    """
+    if not (folder / "config.toml").is_file():
+        raise UsageError(f"{folder} is not a run folder: it has no config.toml")
+    if not (folder / "checkpoints").is_dir():
+        raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
+    config = load_config(folder / "config.toml")
+    run = setup(config if physics is None else config.replace(physics=physics))
+    keys = jax.vmap(jax.random.key)(jnp.arange(config.seeds))
+    like = jax.eval_shape(jax.vmap(functools.partial(learner.init, run), (None, 0)), run.hyper, keys)
+    checkpoints = Checkpoints(folder, read_only=True)
+    try:
+        step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(first_best, like)}, warn)
+    finally:
+        checkpoints.close()
+    return run, step, saved
