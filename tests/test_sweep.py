@@ -238,7 +238,7 @@ def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
     assert f"{tmp_path} holds no run" in cli("table", tmp_path)[2]
     made(tmp_path / "a", "lane", "happo", {0: [1, 1]})
     assert "unknown format 'html'" in cli("table", tmp_path, "--format", "html")[2]
-    assert "no row of lane is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
+    assert "no row is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
     assert "cannot write" in cli("table", tmp_path, "-o", tmp_path / "no" / "where")[2]
 
 
