@@ -241,7 +241,8 @@ def _baselines(table: Sequence[Row], baseline: str) -> dict[str, Row]:
         if len(chosen) > 1:
             listing = ", ".join(f"'{row.label}'" for row in chosen)
             raise UsageError(f"'{baseline}' means several rows of {task}: {listing}; name one of them")
-        result |= {task: row for row in chosen}
+        if chosen:
+            result[task] = chosen[0]
     if not result:
         raise UsageError(f"no row is called '{baseline}'{did_you_mean(baseline, {row.label for row in table})}")
     return result
