@@ -10,6 +10,7 @@ import functools
 import importlib.util
 import inspect
 import pathlib
+import re
 import sys
 import traceback
 import types
@@ -21,12 +22,19 @@ from .errors import TaskError, did_you_mean
 if TYPE_CHECKING:
     from .base import Env
 
+_NAME = re.compile(r"(.*\.py)(?::(\w+))?")
 NEEDS = ("spec", "engine", "reset", "step")  # what training asks of an environment
 
 
 def is_file(name: str) -> bool:
     """Whether `name` means a Python file and not a task of ours."""
-    return name.partition(".py")[1] == ".py" and name.partition(".py")[2][:1] in ("", ":")
+    return _NAME.fullmatch(name) is not None
+
+
+def _split(name: str) -> tuple[pathlib.Path, str | None]:
+    match = _NAME.fullmatch(name)
+    assert match is not None, name  # whoever comes here has asked `is_file`
+    return pathlib.Path(match[1]).absolute(), match[2]
 
 
 def absolute(name: str) -> str:
@@ -35,11 +43,10 @@ def absolute(name: str) -> str:
     Raises:
       TaskError: there is no such file.
     """
-    path, _, chosen = name.partition(".py")
-    file = pathlib.Path(f"{path}.py").absolute()
+    file, chosen = _split(name)
     if not file.is_file():
         raise TaskError(f"there is no environment file {file}")
-    return f"{file}{chosen}"
+    return f"{file}:{chosen}" if chosen else str(file)
 
 
 def factory(name: str) -> Callable[..., Env]:
@@ -48,14 +55,13 @@ def factory(name: str) -> Callable[..., Env]:
     Raises:
       TaskError: no such file, one that cannot be imported, or no such class.
     """
-    path, _, chosen = absolute(name).partition(".py")
-    file = pathlib.Path(f"{path}.py")
+    file, chosen = _split(absolute(name))
     found = vars(_module(file, file.stat().st_mtime_ns))
     if chosen:
-        if not callable(found.get(chosen[1:])):
+        if not callable(found.get(chosen)):
             known = [k for k, v in found.items() if inspect.isclass(v) or inspect.isfunction(v)]
-            raise TaskError(f"{file} has no class or function '{chosen[1:]}'{did_you_mean(chosen[1:], known)}")
-        return found[chosen[1:]]
+            raise TaskError(f"{file} has no class or function '{chosen}'{did_you_mean(chosen, known)}")
+        return found[chosen]
     own: list[Any] = [v for v in found.values() if inspect.isclass(v) and v.__module__ == found["__name__"]]
     envs = [v for v in own if hasattr(v, "reset") and hasattr(v, "step")]
     if len(envs) != 1:

@@ -198,7 +198,7 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
     """Every row as plain data: {column: {iqm, low, high}}, `better` than the baseline, and the `paper`'s numbers.
 
     Args:
-      baseline: a row's label, or a method that has one row per task.
+      baseline: a row's label, or a method with no more than one row per task.
 
     Raises:
       UsageError: no row, or several of one task, are called so.
@@ -220,11 +220,12 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
 
 
 def overall(table: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
-    """By label, the probability of improvement over all tasks together, for rows that stand in every task."""
+    """By label, the probability of improvement over all tasks that have the baseline, for rows that stand in all."""
     rivals = _baselines(table, baseline)
     result = {}
     for label in dict.fromkeys(row.label for row in table):
-        ours = {row.task: row for row in table if row.label == label and row is not rivals[row.task]}
+        mine = [row for row in table if row.label == label and row.task in rivals]
+        ours = {row.task: row for row in mine if row is not rivals[row.task]}
         if len(rivals) > 1 and set(ours) == set(rivals):
             pair = list(ours.values()), [rivals[task] for task in ours]
             result[label] = {column: _improvement(*pair, column) for column in ("reward", "cost")}
@@ -232,19 +233,18 @@ def overall(table: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
 
 
 def _baselines(table: Sequence[Row], baseline: str) -> dict[str, Row]:
-    """The row of every task that the others are held against."""
+    """The row that the others are held against, of every task that has it."""
     result: dict[str, Row] = {}
     for task in dict.fromkeys(row.task for row in table):
         here = [row for row in table if row.task == task]
         chosen = [row for row in here if row.label == baseline] or [row for row in here if row.method == baseline]
-        if not chosen:
-            raise UsageError(
-                f"no row of {task} is called '{baseline}'{did_you_mean(baseline, [r.label for r in here])}"
-            )
         if len(chosen) > 1:
             listing = ", ".join(f"'{row.label}'" for row in chosen)
             raise UsageError(f"'{baseline}' means several rows of {task}: {listing}; name one of them")
-        result[task] = chosen[0]
+        if chosen:
+            result[task] = chosen[0]
+    if not result:
+        raise UsageError(f"no row is called '{baseline}'{did_you_mean(baseline, {row.label for row in table})}")
     return result
 
 

@@ -43,6 +43,16 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """The first of these points as a run of its own."""
+    from pmt_jax.cli import main
+
+    out = tmp_path_factory.mktemp("alone") / "out"
+    assert main([str(a) for a in ("train", "lane", *TINY, "--critic-lr", 0.001, "--no-cache", "--out", out)]) == 0
+    return out
+
+
 def test_points_are_run_folders_and_nothing_else_is_left(swept: pathlib.Path):
     assert sorted(p.name for p in swept.iterdir()) == NAMES
     for name in NAMES:
@@ -52,15 +62,13 @@ def test_points_are_run_folders_and_nothing_else_is_left(swept: pathlib.Path):
         assert [(row["step"], row["seed"]) for row in rows(swept / name)[:3]] == [(200, 0), (200, 1), (400, 0)]
 
 
-def test_a_point_is_the_same_run_alone_to_rounding(swept: pathlib.Path, tmp_path: pathlib.Path, cli):
+def test_a_point_is_the_same_run_alone_to_rounding(swept: pathlib.Path, alone: pathlib.Path):
     """XLA fuses differently where settings have a lane axis, so the last bits differ (3e-7 after 20 updates)."""
-    out = tmp_path / "alone"
-    assert cli("train", "lane", *TINY, "--out", out, "--no-cache", "--critic-lr", 0.001)[0] == 0
-    alone, point = state(out), state(swept / NAMES[0])
-    assert alone.keys() == point.keys()
-    for path in alone:
-        np.testing.assert_allclose(point[path], alone[path], rtol=1e-4, atol=1e-5, err_msg=path)
-    assert (out / "config.toml").read_text() == (swept / NAMES[0] / "config.toml").read_text()
+    expected, point = state(alone), state(swept / NAMES[0])
+    assert expected.keys() == point.keys()
+    for path in expected:
+        np.testing.assert_allclose(point[path], expected[path], rtol=1e-4, atol=1e-5, err_msg=path)
+    assert (alone / "config.toml").read_text() == (swept / NAMES[0] / "config.toml").read_text()
 
 
 def test_a_point_that_diverges_stops_no_other(swept: pathlib.Path):
@@ -239,7 +247,7 @@ def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
     assert f"{tmp_path} holds no run" in cli("table", tmp_path)[2]
     made(tmp_path / "a", "lane", "happo", {0: [1, 1]})
     assert "unknown format 'html'" in cli("table", tmp_path, "--format", "html")[2]
-    assert "no row of lane is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
+    assert "no row is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
     assert "cannot write" in cli("table", tmp_path, "-o", tmp_path / "no" / "where")[2]
 
 
@@ -257,9 +265,9 @@ def test_the_best_row_is_the_one_with_most_reward_within_the_limit():
 # The paper's tables
 
 
-def test_reproduce_runs_what_is_missing_and_prints_it(tmp_path: pathlib.Path, cli, monkeypatch):
+def test_reproduce_runs_what_is_missing_and_prints_it(alone: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     tiny = {"seeds": 2, "num_envs": 4, "rollout_length": 25, "minibatches": 1, "hidden": [8], "epochs": 1}
-    tiny["log_interval"] = 2  # the program of the run alone, above, which is in the compile cache
+    tiny |= {"log_interval": 2, "critic_lr": 0.001}  # the run alone, whose program is in the compile cache
     plan = {"title": "Table 0", "tasks": ["lane"], "methods": ["happo"], "baseline": "happo"}
     paper = {"tables": {"table0": plan}, "budgets": {"smoke": {**tiny, "steps": {"lane": 600}}}, "tasks": {}}
     monkeypatch.setattr(table, "paper", lambda: paper)
@@ -267,6 +275,8 @@ def test_reproduce_runs_what_is_missing_and_prints_it(tmp_path: pathlib.Path, cl
     code, out, _ = cli(*command)
     assert code == 0 and "Table 0, budget 'smoke'" in out
     assert load_config(tmp_path / "lane" / "method=happo" / "config.toml").steps == 600
+    point = state(tmp_path / "lane" / "method=happo")  # has its program to itself, hence bit for bit
+    assert all(np.array_equal(x, point[path]) for path, x in state(alone).items())
     code, again, _ = cli(*command)
     assert code == 0 and "1 of 1 points are finished already" in again
     assert again[again.index("Table 0") :] == out[out.index("Table 0") :]
