@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from typing import Literal, NamedTuple
 
+import pmt_jax
+
 from . import tasks
 from .errors import UsageError
 
-PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 EXTRAS = {"warp-lang": "warp", "matplotlib": "render", "brax": "render", "tensorboardX": "log", "wandb": "log"}
 GL_BACKENDS = ("egl", "osmesa", "glfw")
 _CACHE_PROBE = """
@@ -64,6 +66,7 @@ def report(say: Callable[[str], None]) -> int:
 
 def examine() -> Iterator[Finding]:
     """Looks at everything in turn. Where JAX is missing or a version is wrong, what would need it is left out."""
+    yield Finding("ok", "pmt-jax", f"{pmt_jax.__version__} in {os.path.dirname(pmt_jax.__file__)}")
     yield Finding("ok", "python", f"{platform.python_version()} on {platform.platform()}")
     found = {name: _version(name) for name in PACKAGES}
     for name, version in found.items():

@@ -76,20 +76,15 @@ def train(
             if resume:
                 start = _restore(start, checkpoints, out, say)
             folder.write_settings(out, run)
-            opened = [
-                stack.enter_context(contextlib.closing(sink)) for sink in open_sinks(sinks, out, config, start.step)
-            ]
+            opened = open_sinks(sinks, out, config, start.step)
+            for sink in opened:
+                stack.enter_context(contextlib.closing(sink))
             tracing = stack.enter_context(contextlib.closing(Profile(profile)))
             end = _loop(run, programs, start, checkpoints, opened, tracing)
     except BrokenPipeError:  # standard output's, not the folder's
         raise
     except OSError as error:
-        begun = (out / "config.toml").is_file()
-        next_step = f"continue: {command}" if begun else "train again into another --out"
-        say(
-            f"stopped: cannot write into {out}: {error.strerror or error}. What was saved is whole; make room and "
-            f"{next_step}"
-        )
+        say(_cannot_write(out, error, command))
         return 1
     return _farewell(end, run, out, command, say)
 
@@ -166,6 +161,13 @@ def _loop(
                 saved = time.monotonic()
         checkpoints.save(now.step, now.saved)
     return dataclasses.replace(now, signal=received[0] if received else None)
+
+
+def _cannot_write(out: pathlib.Path, error: OSError, command: str) -> str:
+    """A full disk, a quota, a share that went away."""
+    begun = (out / "config.toml").is_file()
+    then = f"continue: {command}" if begun else "train again into another --out"
+    return f"stopped: cannot write into {out}: {error.strerror or error}. What was saved is whole; make room and {then}"
 
 
 def _farewell(end: _Position, run: Run, out: pathlib.Path, command: str, say: Say) -> int:

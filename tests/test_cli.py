@@ -175,6 +175,10 @@ def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
         (["eval", "lane", "--policy", "zero"], "task 'lane' has no baseline policies"),
         (["eval", "voltage_33", "--policy", "dropp"], "unknown policy 'dropp'; did you mean 'droop'?"),
         (["train", "lane", "--preset", "paper"], "unknown preset 'paper'; did you mean 'paper_letter'?"),
+        (["train", "lane", "--eval-interval", "-1"], "eval_interval must be a number of updates, or 0 for none"),
+        (["export", "runs/none"], "the following arguments are required: -o/--out"),
+        (["export", "runs/none", "-o", "x", "--seed", "first"], "--seed must be a whole number of at least 0"),
+        (["export", "runs/none", "-o", "x"], "runs/none is not a run folder"),
         (["train", "ant_2x4", "--physics", "warp"], "physics 'warp' needs an NVIDIA GPU"),
     ],
 )

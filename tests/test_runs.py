@@ -68,7 +68,7 @@ def copy(whole: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
 
 @pytest.fixture
 def small_disk(tmp_path: pathlib.Path):
-    """A file system of 300 kB, and a function that mounts it anew with other options."""
+    """A file system of 160 kB, room for two checkpoints, and a function that mounts it anew with other options."""
     place = tmp_path / "disk"
     place.mkdir()
 
@@ -76,7 +76,7 @@ def small_disk(tmp_path: pathlib.Path):
         command = ["mount", "-t", "tmpfs", "-o", options, "none", str(place)]
         return subprocess.run(command, capture_output=True).returncode == 0
 
-    if not shutil.which("mount") or not mount("size=300k"):
+    if not shutil.which("mount") or not mount("size=160k"):
         pytest.skip("may not mount a file system here")
     yield place, lambda options: mount(f"remount,{options}")
     subprocess.run(["umount", "-l", str(place)], check=True)
@@ -211,6 +211,7 @@ def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
 def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
     place, remount = small_disk
     out = place / "run"
+    assert remount("size=8m")
     shutil.copytree(whole, out)
     assert remount("ro")
     assert cli("eval", out, "--episodes", 2)[0] == 0
