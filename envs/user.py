@@ -38,14 +38,8 @@ def _split(name: str) -> tuple[pathlib.Path, str | None]:
 
 
 def absolute(name: str) -> str:
-    """`name` with the file's whole path, so that it means the same from every folder.
-
-    Raises:
-      TaskError: there is no such file.
-    """
+    """`name` with the file's whole path, so that it means the same from every folder."""
     file, chosen = _split(name)
-    if not file.is_file():
-        raise TaskError(f"there is no environment file {file}")
     return f"{file}:{chosen}" if chosen else str(file)
 
 
@@ -55,7 +49,9 @@ def factory(name: str) -> Callable[..., Env]:
     Raises:
       TaskError: no such file, one that cannot be imported, or no such class.
     """
-    file, chosen = _split(absolute(name))
+    file, chosen = _split(name)
+    if not file.is_file():
+        raise TaskError(f"there is no environment file {file}")
     found = vars(_module(file, file.stat().st_mtime_ns))
     if chosen:
         if not callable(found.get(chosen)):

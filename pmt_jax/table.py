@@ -32,6 +32,7 @@ FIGURES = {
     "CR": "info/totally_controllable_ratio",
     "PL": "info/total_line_loss",
 }
+LOSSES = ("actor/loss", "critic/loss", "cost_critic/loss")  # null where training went astray: no figures then
 FORMATS = ("text", "markdown", "latex", "json")
 SAME_IN_A_ROW = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
 
@@ -131,10 +132,13 @@ def _read(folder: pathlib.Path) -> _Found:
     evaluated = any(row.get("eval/episode_reward") is not None for row in log)
     prefix = "eval/" if evaluated else ""
     names = {column: prefix + name for column, name in FIGURES.items() if prefix + name in last}
-    figures = {
-        seed: {column: _mean([row[name] for row in log if row["seed"] == seed]) for column, name in names.items()}
-        for seed in {row["seed"] for row in log}
-    }
+    figures = {}
+    for seed in {row["seed"] for row in log}:
+        mine = [row for row in log if row["seed"] == seed]
+        sound = all(mine[-1].get(loss, 0) is not None for loss in LOSSES)
+        figures[seed] = {
+            column: _mean([row[name] for row in mine]) if sound else math.nan for column, name in names.items()
+        }
     source = "evaluation" if evaluated else "training"
     config = load_config(folder / "config.toml")
     return _Found(folder, config, last["task"], last["cost_limit"], steps, source, figures)
@@ -210,9 +214,8 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
         data: dict[str, Any] = {"task": row.task, "method": row.method, "settings": row.settings}
         data |= {"seeds": len(row.figures["reward"]), "steps": row.steps, "source": row.source}
         data |= {"cost_limit": row.cost_limit, **{column: _estimate(x) for column, x in row.figures.items()}}
-        rival = rivals.get(row.task)
-        if rival is not None:
-            data["better"] = None if rival is row else {c: _improvement([row], [rival], c) for c in ("reward", "cost")}
+        rivals_here = [rivals[row.task]] if rivals.get(row.task, row) is not row else []
+        data["better"] = {c: _improvement([row], rivals_here, c) for c in ("reward", "cost")} if rivals_here else None
         given = numbers.get(row.task, {})
         data["paper"] = {"table": given.get("table"), **given.get(row.method, {})}
         result.append(data)

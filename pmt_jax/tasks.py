@@ -65,16 +65,8 @@ def is_file(name: str) -> bool:
 
 
 def absolute(name: str) -> str:
-    """A task's name as it means the same from every folder: that of a file becomes a whole path.
-
-    Raises:
-      UsageError: there is no such file.
-    """
-    envs = _envs()
-    try:
-        return envs.user.absolute(name) if is_file(name) else name
-    except envs.TaskError as error:
-        raise UsageError(str(error)) from None
+    """A task's name as it means the same from every folder: that of a file becomes a whole path."""
+    return _envs().user.absolute(name) if is_file(name) else name
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:

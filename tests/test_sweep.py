@@ -215,8 +215,12 @@ def test_figures_come_from_evaluations_where_there_are_any(tmp_path: pathlib.Pat
 
 def test_a_seed_without_a_figure_shows(tmp_path: pathlib.Path, cli):
     made(tmp_path / "a", "lane", "happo", {0: [1, 1], 1: [None, None]})
-    line = cli("table", tmp_path)[1].splitlines()[2]
-    assert line.split()[:6] == ["lane", "happo", "2", "10,000", "-", "-"]
+    made(tmp_path / "b", "lane", "mappo", {0: [1, 1]}, **{"critic/loss": None})
+    made(tmp_path / "c", "noisy", "happo", {0: [1, 1]})
+    lines = [line.split() for line in cli("table", tmp_path, "--baseline", "mappo")[1].splitlines()[2:5]]
+    assert lines[0][:6] == ["lane", "mappo", "1", "10,000", "-", "-"]
+    assert lines[1][:6] == ["lane", "happo", "2", "10,000", "-", "-"]
+    assert lines[2][:6] == ["noisy", "happo", "1", "10,000", "1", "[1,"]  # a task without the baseline
 
 
 def test_the_papers_numbers_stand_beside_ours_in_every_format(tmp_path: pathlib.Path, cli):
