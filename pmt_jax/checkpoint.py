@@ -117,7 +117,7 @@ class Checkpoints:
         """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
 
         Args:
-          warn: told of every newer one that is damaged.
+          warn: told of every newer one that cannot be read.
 
         Raises:
           UsageError: there is none, or it belongs to another kind of run.
@@ -126,13 +126,15 @@ class Checkpoints:
             try:
                 with _quiet():
                     restored: Any = self._manager.restore(step, args=ocp.args.StandardRestore())
+                if "npz" not in restored:
+                    raise ValueError("it is of another version of pmt-jax")
                 packed = _from_bytes(np.asarray(restored["npz"]))
             except (ValueError, KeyError, OSError) as error:
-                warn(f"the checkpoint after {step:,} steps in {self._folder} is damaged ({_reason(error)})")
+                warn(f"the checkpoint after {step:,} steps in {self._folder} cannot be read ({_reason(error)})")
                 continue
             return step, unpack(packed, like)
         if self.steps():
-            raise UsageError(f"every checkpoint in {self._folder} is damaged; restore one from a backup or train anew")
+            raise UsageError(f"no checkpoint in {self._folder} can be read; restore one from a backup or train anew")
         raise UsageError(f"there is no finished checkpoint in {self._folder}; train the run first")
 
     def forget_after(self, step: int) -> None:

@@ -164,14 +164,14 @@ def damage(step: pathlib.Path) -> None:
 def test_a_damaged_checkpoint_is_noticed_and_the_one_before_taken(whole: pathlib.Path, copy: pathlib.Path, cli):
     damage(copy / "checkpoints" / str(STEPS))
     code, text, _ = cli("eval", copy, "--episodes", 2)
-    assert code == 0 and f"the checkpoint after {STEPS:,} steps in {copy / 'checkpoints'} is damaged" in text
+    assert code == 0 and f"the checkpoint after {STEPS:,} steps in {copy / 'checkpoints'} cannot be read (" in text
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
-    assert code == 0 and "is damaged" in text and "resuming after 1,400 steps" in text
+    assert code == 0 and "cannot be read" in text and "resuming after 1,400 steps" in text
     assert_same_run(copy, whole)
     for step in (copy / "checkpoints").iterdir():
         damage(step)
     code, _, err = cli("eval", copy)
-    assert code == 2 and "every checkpoint" in err and "restore one from a backup or train anew" in err
+    assert code == 2 and "no checkpoint in" in err and "restore one from a backup or train anew" in err
 
 
 def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
