@@ -13,67 +13,56 @@ winner on fresh seeds before believing it.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import pathlib
-import time
+import tempfile
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pmt_jax import evaluate, learner, load_config, setup
-from pmt_jax.run import Run
+from pmt_jax import Config, evaluate, load_config, setup, sweep
+from pmt_jax.experiment import load_run
 
 Ranges = dict[str, tuple[float, float]]  # name -> (lowest, highest)
 
 CURVE = ("episode_reward", "episode_cost", "violation_rate", "lambda", "step_reward", "actor/std", "actor/kl_per_agent")
 
 
-def draw(run: Run, draws: int, seed: int, ranges: Ranges) -> Any:
-    """The run's settings with `draws` random values of those in `ranges`: leaves [draws]."""
+def draw(config: Config, draws: int, seed: int, ranges: Ranges) -> sweep.Points:
+    """`draws` runs of one seed each, with random values of the settings in `ranges`."""
     rng = np.random.default_rng(seed)
-    hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), run.hyper)
-    drawn = {
-        n: jnp.asarray(np.exp(rng.uniform(np.log(r[0]), np.log(r[1]), draws)), jnp.float32) for n, r in ranges.items()
+    drawn = {name: np.exp(rng.uniform(np.log(low), np.log(high), draws)) for name, (low, high) in ranges.items()}
+    return {
+        f"draw{i:03}": config.replace(seeds=1, seed=seed + i, **{name: float(x[i]) for name, x in drawn.items()})
+        for i in range(draws)
     }
-    return dataclasses.replace(hyper, **drawn)
 
 
-def search(run: Run, hyper: Any, draws: int, seed: int, seconds: float, episodes: int) -> dict[str, Any]:
-    """Trains every draw until its steps are done or the time is up, then evaluates it over `episodes` episodes.
+def search(points: sweep.Points, episodes: int) -> dict[str, Any]:
+    """Trains `points`, which share a program, side by side, then evaluates them over `episodes` episodes.
 
-    Curves have one entry per chunk and draw; evaluations are means over episodes, one per draw, of sampled and of mean
-    actions.
+    Curves have one entry per chunk and lane (a seed of a point); evaluations are means over episodes, one per lane, of
+    sampled and of mean actions.
     """
-    config = run.config
-    keys = jax.vmap(jax.random.key)(jnp.arange(seed, seed + draws))
-    begin = time.monotonic()
-    state = jax.jit(jax.vmap(lambda h, k: learner.init(run, h, k)))(hyper, keys)
-    chunk = jax.jit(jax.vmap(lambda h, s: learner.train_chunk(run, h, s, config.log_interval)), donate_argnums=1)
-    curves: dict[str, list[list[float | None]]] = {}
-    marks = []
-    for done in range(config.num_chunks):
-        state, metrics = chunk(hyper, state)
-        metrics = jax.device_get(metrics)
-        for name in metrics:
-            if name not in CURVE and not name.startswith(("info/", "fear/", "regret/")):
-                continue
-            curves.setdefault(name, [])
-            values = np.asarray(metrics[name]).reshape(draws, -1)
-            curves[name].append([float(np.nanmean(row)) if np.isfinite(row).any() else None for row in values])
-        marks.append(round(time.monotonic() - begin, 2))
-        if done % 10 == 0:
-            print(f"{config.task} chunk {done + 1}/{config.num_chunks}, {marks[-1]} s", flush=True)
-        if marks[-1] > seconds:
-            break
-    steps = [(i + 1) * config.batch_size * config.log_interval for i in range(len(marks))]
-    rate = draws * (steps[-1] - steps[0]) / max(marks[-1] - marks[0], 1e-9)
-    found = {"steps": steps, "seconds": marks, "steps_per_second": rate, "curves": curves}
+    with tempfile.TemporaryDirectory() as folder:
+        out = pathlib.Path(folder)
+        if sweep.train_points(points, out):
+            raise SystemExit(130)
+        runs = [load_run(out / name) for name in points]
+        logs = [[json.loads(line) for line in (out / name / "metrics.jsonl").open()] for name in points]
+    lanes = [[row for row in log if row["seed"] == seed] for log in logs for seed in sorted({r["seed"] for r in log})]
+    first = lanes[0]
+    steps, seconds = ([row[name] for row in first] for name in ("step", "seconds"))
+    rate = len(lanes) * (steps[-1] - steps[0]) / max(seconds[-1] - seconds[0], 1e-9)
+    names = [name for name in first[0] if name in CURVE or name.startswith(("info/", "fear/", "regret/"))]
+    curves = {name: [[lane[i][name] for lane in lanes] for i in range(len(first))] for name in names}
+    found = {"steps": steps, "seconds": seconds, "steps_per_second": rate, "curves": curves}
+    states = jax.tree.map(lambda *each: jnp.concatenate(each), *(state for _, state in runs))
     for how in ("sampled", "mean") if episodes else ():
-        judge = jax.jit(jax.vmap(lambda s: evaluate(run, s, episodes, deterministic=how == "mean")))  # noqa: B023
-        found[f"evaluation_{how}"] = {k: x.mean(1).tolist() for k, x in jax.device_get(judge(state)).items()}
+        judge = jax.jit(jax.vmap(lambda s: evaluate(runs[0][0], s, episodes, deterministic=how == "mean")))  # noqa: B023
+        found[f"evaluation_{how}"] = {k: x.mean(1).tolist() for k, x in jax.device_get(judge(states)).items()}
     return found
 
 
@@ -97,7 +86,6 @@ def main() -> None:
     parser.add_argument("--vary", default="", metavar="NAME=LOW:HIGH,...", help="which settings are drawn, from where")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", default="1e6")
-    parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--episodes", type=int, default=0, help="evaluate every draw at the end over so many episodes")
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
@@ -109,15 +97,14 @@ def main() -> None:
     fixed: dict[str, Any] = dict(pair.split("=", 1) for pair in arguments.fixed)
     if "env" in fixed:
         fixed["env"] = fixed["env"].split(",")
-    jax.config.update("jax_default_matmul_precision", "highest")
-    run = setup(load_config(arguments.task, method=arguments.method, steps=arguments.steps, **fixed))
+    config = load_config(arguments.task, method=arguments.method, steps=arguments.steps, **fixed)
     pairs = [pair.split("=") for pair in arguments.vary.split(",") if pair]
     ranges: Ranges = {name: (float(bounds.split(":")[0]), float(bounds.split(":")[1])) for name, bounds in pairs}
-    hyper = draw(run, arguments.draws, arguments.seed, ranges)
-    found = search(run, hyper, arguments.draws, arguments.seed, arguments.seconds, arguments.episodes)
-    found["drawn"] = {n: np.asarray(getattr(hyper, n)).tolist() for n in ranges}
+    points = draw(config, arguments.draws, arguments.seed, ranges)
+    found = search(points, arguments.episodes)
+    found["drawn"] = {name: [getattr(point, name) for point in points.values()] for name in ranges}
     found |= {"task": arguments.task, "method": arguments.method, "fixed": arguments.fixed}
-    found |= {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "engine": run.vector.env.engine}
+    found |= {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "engine": setup(config).vector.env.engine}
     arguments.out.write_text(json.dumps(found))
     print(f"{found['steps_per_second']:,.0f} steps/s over all draws; written to {arguments.out}")
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pmt_jax import METHODS, load_config, make_train
+from pmt_jax.statistics import bootstrap_interval
 
 SEEDS = 5
 LAST = 15
@@ -49,9 +50,8 @@ FIGURES = ("episode_cost", "episode_reward", "lambda")
 
 def interval(values: list[float], digits: int = 2) -> str:
     """Mean and 95 % bootstrap interval over seeds."""
-    x, rng = np.asarray(values), np.random.default_rng(0)
-    low, high = np.quantile(rng.choice(x, (10_000, len(x))).mean(1), [0.025, 0.975])
-    return f"{x.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    low, high = bootstrap_interval([values], np.mean)
+    return f"{np.mean(values):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def table(rows: list[dict[str, Any]]) -> str:

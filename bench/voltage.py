@@ -16,9 +16,8 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from pmt_jax import METHODS, load_config, setup
+from pmt_jax import METHODS, load_config
 from pmt_jax.experiment import evaluate_baseline
 
 from .search import search
@@ -36,10 +35,9 @@ FIGURES = {
 
 def learned(method: str, steps: str, **changes: Any) -> dict[str, Any]:
     """One method's figures per seed, and how long it took."""
-    run = setup(load_config(TASK, method=method, steps=steps, log_interval=5, **changes))
-    hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (SEEDS,)), run.hyper)
+    config = load_config(TASK, method=method, steps=steps, seeds=SEEDS, log_interval=5, **changes)
     begin = time.monotonic()
-    found = search(run, hyper, SEEDS, seed=0, seconds=1e9, episodes=EPISODES)
+    found = search({method: config}, episodes=EPISODES)
     figures = {name: found["evaluation_mean"][key] for name, key in FIGURES.items()}
     rates = {"seconds": round(time.monotonic() - begin, 1), "steps_per_second": round(found["steps_per_second"])}
     return {"policy": method, "steps": found["steps"][-1], **rates, **figures}

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from . import user
 from .errors import TaskError, did_you_mean
 
 if TYPE_CHECKING:
@@ -37,11 +39,12 @@ def make(name: str, **options: Any) -> Env:
     """Builds a task.
 
     Args:
-      name: one of `names()`.
+      name: one of `names()`, or a Python file that keeps the contract: `my_env.py`, `my_env.py:Name`.
       **options: the task's own options, e.g. `physics="mjx"`; see the task's class.
 
     Raises:
-      TaskError: unknown name or option (the nearest known one is named), or an engine that cannot run here.
+      TaskError: unknown name or option (the nearest known one is named), an engine that cannot run here, or a file
+        that does not keep the contract.
 
     Example:
       >>> make("lane").spec.num_agents
@@ -52,7 +55,7 @@ def make(name: str, **options: Any) -> Env:
         if option not in known:
             raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
     cls, fixed = _task(name)
-    return cls(**fixed, **options)
+    return user.build(cls, name, options) if user.is_file(name) else cls(**fixed, **options)
 
 
 def task_options(name: str) -> list[str]:
@@ -65,7 +68,9 @@ def task_options(name: str) -> list[str]:
     return [p for p in inspect.signature(cls).parameters if p not in fixed]
 
 
-def _task(name: str) -> tuple[type, dict[str, Any]]:
+def _task(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    if user.is_file(name):
+        return user.factory(name), {}
     if name not in _TASKS:
         raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
     module, class_name, fixed = _TASKS[name]

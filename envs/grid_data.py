@@ -58,6 +58,7 @@ class Profiles:
 
     @property
     def num_rows(self) -> int:
+        """Rows of 3 minutes, those between the knots included."""
         return (len(self.pv) - 1) * self.rows_per_knot + 1
 
     @property

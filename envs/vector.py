@@ -71,6 +71,7 @@ class VectorEnv:
 
     @property
     def spec(self) -> EnvSpec:
+        """The task's."""
         return self.env.spec
 
     def reset(self, key: jax.Array) -> VectorState:

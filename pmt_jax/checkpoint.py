@@ -143,6 +143,7 @@ class Checkpoints:
             self._manager.delete(later)
 
     def close(self) -> None:
+        """Lets go of the folder."""
         self._manager.close()
 
 

@@ -1,10 +1,11 @@
-"""`pmt train | eval | export | render | plot | report | doctor | envs`: words into settings, nothing else."""
+"""`pmt train | eval | sweep | table | reproduce | ...`: words into settings, nothing else."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import pathlib
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -69,6 +70,9 @@ def _parser() -> tuple[_Parser, list[str]]:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     _add_train(commands)
     _add_eval(commands)
+    _add_sweep(commands)
+    _add_table(commands)
+    _add_reproduce(commands)
     _add_export(commands)
     doctor = commands.add_parser("doctor", help="what of this machine can be used, and why not the rest")
     doctor.set_defaults(run=_doctor)
@@ -87,7 +91,11 @@ def _add_train(commands: Any) -> None:
         description="Trains on TASK, or as a TOML file says.",
         allow_abbrev=False,
     )
-    train.add_argument("source", metavar="TASK|CONFIG", help="a task's name (pmt envs lists them) or a TOML file")
+    train.add_argument(
+        "source",
+        metavar="TASK|CONFIG",
+        help="a task's name (pmt envs lists them), a TOML file, or a Python file with a task of your own: my_env.py",
+    )
     train.add_argument("--out", type=pathlib.Path, help="the run folder (default: runs/TASK-METHOD-TIME)")
     train.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     train.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
@@ -95,8 +103,14 @@ def _add_train(commands: Any) -> None:
         "--sink", default="", metavar="NAMES", help="figures also go to csv, tensorboard, wandb (any, with commas)"
     )
     train.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="write a JAX profiler trace of a few chunks")
-    train.add_argument("--preset", default="default", help=f"{' | '.join(settings.PRESETS)}")
-    group = train.add_argument_group("settings", "each may also stand in the TOML file")
+    _add_settings(train)
+    train.set_defaults(run=_train)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """A flag for every field of Config."""
+    parser.add_argument("--preset", default="default", help=f"{' | '.join(settings.PRESETS)}")
+    group = parser.add_argument_group("settings", "each may also stand in the TOML file")
     defaults = settings.Config()
     for name, text in settings.descriptions().items():
         if name == "task":  # it is the positional argument
@@ -108,7 +122,11 @@ def _add_train(commands: Any) -> None:
         flag = f"--{name.replace('_', '-')}"
         action = "append" if name == "env" else "store"
         group.add_argument(flag, dest=f"set_{name}", metavar=_METAVARS.get(kind, "WORD"), action=action, help=hint)
-    train.set_defaults(run=_train)
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The settings that the command line names."""
+    return {k.removeprefix("set_"): v for k, v in vars(arguments).items() if k.startswith("set_") and v is not None}
 
 
 def _add_eval(commands: Any) -> None:
@@ -126,6 +144,66 @@ def _add_eval(commands: Any) -> None:
     _add_which(evaluation)
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
     evaluation.set_defaults(run=_eval)
+
+
+def _add_sweep(commands: Any) -> None:
+    sweep = commands.add_parser(
+        "sweep",
+        help="train many settings side by side: pmt sweep ant_2x4 --set lambda_lr=0.03,0.1,0.3 --set fear_l2=0,1",
+        description="Trains every combination of the --set values; the same command goes on where it was interrupted.",
+        allow_abbrev=False,
+    )
+    sweep.add_argument("source", metavar="TASK|CONFIG", help="as for pmt train")
+    sweep.add_argument(
+        "--set",
+        action="append",
+        required=True,
+        dest="vary",
+        metavar="NAME=VALUE,...",
+        help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]",
+    )
+    sweep.add_argument("--out", type=pathlib.Path, required=True, help="the folder that gets a run folder per point")
+    sweep.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_settings(sweep)
+    sweep.set_defaults(run=_sweep)
+
+
+def _add_table(commands: Any) -> None:
+    table = commands.add_parser(
+        "table",
+        help="compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
+        description="One row per task, method and settings: interquartile means with 95 %% bootstrap intervals.",
+        allow_abbrev=False,
+    )
+    table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
+    table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
+    _add_format(table)
+    table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
+    table.set_defaults(run=_table)
+
+
+def _add_reproduce(commands: Any) -> None:
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="run what is missing for a table of the paper and print it: pmt reproduce table1",
+        description="The same command goes on where it was interrupted.",
+        allow_abbrev=False,
+    )
+    reproduce.add_argument("table", metavar="TABLE", help="table1 | table2 | table3 | fig4")
+    reproduce.add_argument(
+        "--budget",
+        default="smoke",
+        metavar="WORD",
+        help="smoke (default): minutes, to see that everything runs | paper: 5 seeds, all steps; days on a CPU",
+    )
+    reproduce.add_argument("--out", type=pathlib.Path, help="the folder of its runs (default: runs/reproduce-BUDGET)")
+    reproduce.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_format(reproduce)
+    reproduce.set_defaults(run=_reproduce)
+
+
+def _add_format(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--format", default="text", metavar="WORD", help="text (default) | markdown | latex | json")
 
 
 def _add_export(commands: Any) -> None:
@@ -193,8 +271,7 @@ def _add_report(commands: Any) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    given = {k.removeprefix("set_"): v for k, v in vars(arguments).items() if k.startswith("set_") and v is not None}
-    config = settings.load_config(arguments.source, preset=arguments.preset, **given)
+    config = settings.load_config(arguments.source, preset=arguments.preset, **_given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
     _quiet_xla()
@@ -242,6 +319,49 @@ def _eval(arguments: argparse.Namespace) -> int:
             if isinstance(figures, tuple):
                 print(f"  {name:24} {figures[0]:12.4f} +- {figures[1]:.4f}")
     return 0
+
+
+def _sweep(arguments: argparse.Namespace) -> int:
+    vary = dict(_values(word) for word in arguments.vary)
+    _quiet_xla()
+    from . import sweep
+
+    points = sweep.grid(arguments.source, vary, arguments.preset, **_given(arguments))
+    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say)
+
+
+def _values(word: str) -> tuple[str, list[str]]:
+    """NAME=VALUE,... as the name and its values."""
+    name, _, values = word.partition("=")
+    if not values:
+        raise UsageError(f"--set takes NAME=VALUE,VALUE,..., not '{word}'")
+    if name == "task":
+        raise UsageError("a sweep has one task; sweep each of them with its own --out")
+    parts = re.findall(r"\[[^\]]*\]|[^,]+", values)
+    return name.replace("-", "_"), [part.strip("[]") for part in parts]
+
+
+def _table(arguments: argparse.Namespace) -> int:
+    from . import table
+
+    text = table.render(table.rows(table.find_runs(arguments.sources)), arguments.format, arguments.baseline)
+    if arguments.output is None:
+        print(text, end="")
+        return 0
+    try:
+        arguments.output.write_text(text)
+    except OSError as error:
+        raise UsageError(f"cannot write {arguments.output}: {error.strerror}; choose another -o") from None
+    return 0
+
+
+def _reproduce(arguments: argparse.Namespace) -> int:
+    _quiet_xla()
+    from . import sweep
+
+    out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
+    cache = not arguments.no_cache
+    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache=cache, say=_say)
 
 
 def _whole(flag: str, text: str, least: int) -> int:

@@ -65,16 +65,16 @@ def cache_events() -> Iterator[list[str]]:
 
 def compile_run(run: Run, say: Callable[[str], None]) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
-    config, hyper = run.config, run.hyper
+    config = run.config
     say("compiling ...")
     begin = time.monotonic()
-    keys = jax.vmap(jax.random.key)(jnp.arange(config.seed, config.seed + config.seeds))
-    state = jax.jit(jax.vmap(functools.partial(learner.init, run), (None, 0)))(hyper, keys)
+    hyper, keys, axes = run.side_by_side
+    state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
         return learner.train_chunk(run, hyper, state, config.log_interval)
 
-    lowered = jax.jit(jax.vmap(chunk, (None, 0)), donate_argnums=1).lower(hyper, state)
+    lowered = jax.jit(jax.vmap(chunk, axes), donate_argnums=1).lower(hyper, state)
     with cache_events() as events:
         compiled = lowered.compile()
     evaluation = None

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from .errors import UsageError
 from .methods import METHODS
-from .tasks import did_you_mean
+from .tasks import absolute, did_you_mean, is_file
 
 _INSTALLED = pathlib.Path(__file__).parent / "configs"
 CONFIG_DIR = _INSTALLED if _INSTALLED.is_dir() else pathlib.Path(__file__).parent.parent / "configs"
@@ -89,7 +89,7 @@ class Config(Hyper):
     """A run in full.
 
     Attributes:
-      task: what to train on; `pmt envs` lists them.
+      task: what to train on; `pmt envs` lists them, and a Python file may hold one of your own.
       method: who learns; a row of the table in pmt_jax/methods.py.
       steps: environment steps to train for, per seed, over all its environments; rounded up to whole chunks.
       seeds: how many seeds train side by side in one program.
@@ -166,6 +166,7 @@ class Config(Hyper):
 
     @property
     def num_updates(self) -> int:
+        """Updates that cover `steps`, in whole chunks."""
         return self.num_chunks * self.log_interval
 
     def replace(self, **changes: Any) -> Config:
@@ -208,7 +209,8 @@ def load_config(
     """Settings of a task: defaults, then the file, its [method.NAME] table, the preset, then `overrides`.
 
     Args:
-      source: a name in configs/, or the path of a TOML file (a run's own config.toml included).
+      source: a name in configs/, the path of a TOML file (a run's own config.toml included), or a Python file with an
+        environment of your own (`my_env.py`, `my_env.py:Name`).
       method: a name in METHODS; the file's own choice if None.
       preset: a name in PRESETS.
       **overrides: any field of Config.
@@ -236,10 +238,14 @@ def load_config(
     for name, value in PRESETS[preset].items():
         other = values.get(value, getattr(Config, value)) if value in FIELDS else value
         values = {**values, name: overrides.get(name, other)}
+    if "task" in values:
+        values["task"] = absolute(str(values["task"]))
     return Config(**{k: convert(k, v) for k, v in values.items()})
 
 
 def _read(source: str | pathlib.Path) -> dict[str, Any]:
+    if is_file(str(source)):
+        return {"task": str(source)}
     known = sorted(p.stem for p in CONFIG_DIR.glob("*.toml"))
     path = CONFIG_DIR / f"{source}.toml" if str(source) in known else pathlib.Path(source)
     if not path.is_file():

@@ -22,7 +22,7 @@ from .compiling import Programs, compile_run, evaluate_seeds, use_cache
 from .config import Config
 from .evaluation import improves, interval, play
 from .folder import Say, load_run
-from .run import Run, setup
+from .run import Lanes, Run, setup
 from .sinks import Profile, Sink, check_sinks, duration, open_sinks
 from .types import Best, LearnerState, Metrics
 
@@ -39,6 +39,7 @@ def train(
     sinks: Sequence[str] = (),
     profile: pathlib.Path | None = None,
     say: Say = print,
+    lanes: Lanes | None = None,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -48,6 +49,8 @@ def train(
       cache: keep compiled programs on disk for the next start.
       sinks: where the figures go besides metrics.jsonl: csv, tensorboard, wandb.
       profile: a folder for a JAX profiler trace of a few chunks.
+      lanes: settings and seeds of `config.seeds` lanes, in place of the config's; one whose loss stops being finite
+        does not stop the others.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a loss stopped
@@ -58,15 +61,15 @@ def train(
     """
     jax.config.update("jax_default_matmul_precision", folder.MATMUL_PRECISION)
     check_sinks(sinks)
-    run = setup(config)
-    out = out or pathlib.Path("runs") / f"{config.task}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
+    run = dataclasses.replace(setup(config), lanes=lanes)
+    out = out or pathlib.Path("runs") / f"{run.vector.spec.name}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.open_folder(out, run, resume, say)
     _announce(run, out, say)
     if cache:
         use_cache()
     state, programs = compile_run(run, say)
     start = _Position(state, folder.first_best(state))
-    command = f"pmt train {out / 'config.toml'} --out {out} --resume"
+    command = "the same command" if lanes else f"pmt train {out / 'config.toml'} --out {out} --resume"
     try:
         with contextlib.ExitStack() as stack:
             checkpoints = stack.enter_context(contextlib.closing(Checkpoints(out)))
@@ -144,7 +147,7 @@ def _loop(
             state, metrics = programs.chunk(now.state)
             step = now.step + config.log_interval * config.batch_size
             rows = _rows(run, step, jax.device_get(metrics))
-            broken = _broken(rows)
+            broken = None if run.lanes else _broken(rows)
             rows = _with_evaluation(run, programs, state, rows, skip=broken is not None)
             seconds = start.seconds + time.monotonic() - begin
             for sink in sinks:
@@ -175,7 +178,8 @@ def _farewell(end: _Position, run: Run, out: pathlib.Path, command: str, say: Sa
     if end.step < run.config.num_updates * run.config.batch_size:
         say(f"interrupted after {end.step:,} steps; saved. Continue with: {command}")
         return 128 + (end.signal or signal.SIGINT)
-    say(f"done: {end.step:,} steps in {duration(end.seconds)}; evaluate with: pmt eval {out}")
+    next_step = "" if run.lanes else f"; evaluate with: pmt eval {out}"
+    say(f"done: {end.step:,} steps in {duration(end.seconds)}{next_step}")
     return 0
 
 
@@ -191,7 +195,7 @@ def _rows(run: Run, step: int, metrics: dict[str, np.ndarray]) -> list[dict[str,
         row: dict[str, Any] = {
             "step": step,
             "seed": config.seed + i,
-            "task": config.task,
+            "task": run.vector.spec.name,
             "method": config.method,
             "cost_limit": run.cost_limit,
         }

@@ -150,6 +150,18 @@ def load_run(
     """
     if which not in WHICH:
         raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
+    run, _, saved = load_saved(folder, physics, warn)
+    return run, saved["last"] if which == "last" else saved["best"].state
+
+
+def load_saved(
+    folder: pathlib.Path, physics: str | None = None, warn: Callable[[str], object] = warnings.warn
+) -> tuple[Run, int, dict[str, Any]]:
+    """A run's settings, the step of its newest whole checkpoint, and all that it holds: `last` and `best`.
+
+    Raises:
+      UsageError: the folder holds no run, or no checkpoint.
+    """
     if not (folder / "config.toml").is_file():
         raise UsageError(f"{folder} is not a run folder: it has no config.toml")
     if not (folder / "checkpoints").is_dir():
@@ -160,7 +172,7 @@ def load_run(
     like = jax.eval_shape(jax.vmap(functools.partial(learner.init, run), (None, 0)), run.hyper, keys)
     checkpoints = Checkpoints(folder, read_only=True)
     try:
-        _, saved = checkpoints.load({"last": like, "best": jax.eval_shape(first_best, like)}, warn)
+        step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(first_best, like)}, warn)
     finally:
         checkpoints.close()
-    return run, saved["last"] if which == "last" else saved["best"].state
+    return run, step, saved

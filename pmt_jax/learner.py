@@ -161,11 +161,12 @@ def _appraise_fear(
 ) -> tuple[Trained | None, jax.Array, Metrics]:
     """Learns from the observed costs first, then says how fearful every step was: [T, B, N, K] in (0, 1).
 
-    Without a fear prior network the signal is the cost itself. Calibration is that of the network before it has seen
-    the batch.
+    Without a fear prior network the signal is the cost itself, or what the method makes of the batch. Calibration is
+    that of the network before it has seen the batch.
     """
     if net is None:
-        return None, batch.cost, {}
+        signal = run.method.cost_signal
+        return None, signal(batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if run.config.fear_time == "next" else batch.state
     remembered = jax.nn.sigmoid(run.nets.fear(net.params, seen))
     rows = jax.tree.map(_flat, (seen, batch.cost, remembered))

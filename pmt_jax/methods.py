@@ -9,7 +9,13 @@ Adding one is adding a row:
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    import jax
+
+    from .types import Batch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,14 +27,15 @@ class Method:
         each corrected by the factor M of those before it (HAPPO).
       constraint: how the cost limit acts: `none`, a `lagrangian` multiplier per agent and cost, or a `trust_region`
         whose step keeps within the limit (CPO).
-      cost_signal: what counts as danger in the cost advantage: the `cost` itself, or the `fear` of it.
+      cost_signal: what counts as danger in the cost advantage: the `cost` itself, the `fear` of it, or a function of
+        your own, Batch -> [T, B, N, K] (docs/tutorial.ipynb has one).
       ratio_weight: what biases the probability ratio: nothing, or `regret`.
       share_actor: one actor for all agents (needs equal action spaces and agent ids in the observation).
     """
 
     order: Literal["simultaneous", "sequential"]
     constraint: Literal["none", "lagrangian", "trust_region"]
-    cost_signal: Literal["cost", "fear"] = "cost"
+    cost_signal: Literal["cost", "fear"] | Callable[[Batch], jax.Array] = "cost"
     ratio_weight: Literal["none", "regret"] = "none"
     share_actor: bool = False
 

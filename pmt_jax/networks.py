@@ -100,12 +100,15 @@ class Networks:
         return jax.vmap(lambda k: self.actor.init(k, jnp.zeros(self.obs_dim)))(keys)
 
     def init_critic(self, key: jax.Array) -> Params:
+        """Weights of V."""
         return self.critic.init(key, jnp.zeros(self.state_dim))
 
     def init_cost_critic(self, key: jax.Array) -> Params:
+        """Weights of Vc, all heads [N, K] in one network."""
         return self.cost_critic.init(key, jnp.zeros(self.state_dim))
 
     def init_fear(self, key: jax.Array) -> Params:
+        """Weights of the fear prior network, all heads [N, K] in one."""
         return self.fear_net.init(key, jnp.zeros(self.state_dim))
 
     def init_regret(self, key: jax.Array) -> Params:

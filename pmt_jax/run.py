@@ -16,13 +16,29 @@ from .types import Moments
 
 
 @dataclasses.dataclass(frozen=True)
+class Lanes:
+    """What trains side by side in one program where it is more than the seeds of one run: a part of a sweep.
+
+    Attributes:
+      hyper: every lane's own settings, leaves [L], or [] where all share them; seed: [L] int32.
+    """
+
+    hyper: Hyper
+    seed: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
-    """What is fixed before training: settings, a row of the method table, the task and the networks' functions."""
+    """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
+
+    With `lanes`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
+    """
 
     config: Config
     method: Method
     vector: tasks.VectorEnv
     nets: networks.Networks
+    lanes: Lanes | None = None
 
     @property
     def cost_limit(self) -> float:
@@ -40,6 +56,14 @@ class Run:
         values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": self.cost_limit}
         traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
         return Hyper(**traced)
+
+    @property
+    def side_by_side(self) -> tuple[Hyper, jax.Array, tuple[int | None, int]]:
+        """What one program trains: settings (leaves [] or [seeds]), keys [seeds], and the axes that vmap maps over."""
+        keys = jax.vmap(jax.random.key)
+        if self.lanes is None:
+            return self.hyper, keys(jnp.arange(self.config.seed, self.config.seed + self.config.seeds)), (None, 0)
+        return self.lanes.hyper, keys(self.lanes.seed), (0 if jnp.ndim(self.lanes.hyper.clip) else None, 0)
 
 
 def setup(config: Config, env: tasks.Env | None = None) -> Run:

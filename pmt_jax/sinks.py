@@ -57,8 +57,13 @@ def open_sinks(names: Sequence[str], out: pathlib.Path, config: Config, step: in
 class Sink(Protocol):
     """Gets a chunk's rows, one per seed, then is closed."""
 
-    def write(self, rows: list[Row]) -> None: ...
-    def close(self) -> None: ...
+    def write(self, rows: list[Row]) -> None:
+        """Takes a chunk's rows."""
+        ...
+
+    def close(self) -> None:
+        """Comes once, after the last rows."""
+        ...
 
 
 class Jsonl:

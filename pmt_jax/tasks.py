@@ -22,9 +22,11 @@ __all__ = [
     "State",
     "VectorEnv",
     "VectorState",
+    "absolute",
     "baseline",
     "did_you_mean",
     "engines",
+    "is_file",
     "make",
     "names",
 ]
@@ -55,6 +57,16 @@ def __getattr__(name: str) -> Any:
 def names() -> list[str]:
     """The tasks that `make` knows."""
     return _envs().names()
+
+
+def is_file(name: str) -> bool:
+    """Whether a task's name means a Python file of the user's (`my_env.py`, `my_env.py:Name`)."""
+    return _envs().user.is_file(name)
+
+
+def absolute(name: str) -> str:
+    """A task's name as it means the same from every folder: that of a file becomes a whole path."""
+    return _envs().user.absolute(name) if is_file(name) else name
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
@@ -96,7 +108,7 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
     """Builds a task, with the engine asked for where it has one.
 
     Raises:
-      UsageError: unknown task or option, or an engine that cannot run here.
+      UsageError: unknown task or option, an engine that cannot run here, or a file that does not keep the contract.
     """
     envs = _envs()
     try:

@@ -18,12 +18,14 @@ FOLDER = "networks/1-complete_data-mixed-all-1-sw"
 
 
 def read(path: Path, columns: list[str]) -> np.ndarray:
+    """The named columns of one of simbench's csv files: [rows, columns]."""
     with path.open() as file:
         header = file.readline().strip().split(";")
     return np.loadtxt(path, delimiter=";", skiprows=1, usecols=[header.index(c) for c in columns])
 
 
 def main() -> None:
+    """Writes the pack beside this file."""
     spec = importlib.util.find_spec("simbench")
     if spec is None or spec.origin is None:
         raise SystemExit("pip install --no-deps simbench==1.6.3 first")

@@ -1,0 +1,207 @@
+"""Many settings at once: what is traced differs within one program, what is static gets a program each.
+
+A finished point is a run folder like any other. Points of one program train together as the lanes of one hidden run,
+`.group-N`, which checkpoints and resumes as every run does and is cut into the points' folders when it is done.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import pathlib
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from . import experiment, table
+from .checkpoint import Checkpoints
+from .config import HYPER_FIELDS, Config, load_config, to_toml
+from .errors import UsageError
+from .folder import Say, load_saved, read_rows
+from .methods import METHODS
+from .run import Lanes, setup
+from .tasks import did_you_mean, names
+
+Points = dict[str, Config]  # by the name of the point's folder
+
+# The cost limit is traced too, but what is written about a run is written for one limit.
+TRACED = tuple(name for name in HYPER_FIELDS if name != "cost_limit")
+
+
+def grid(
+    source: str | pathlib.Path, vary: Mapping[str, Sequence[str]], preset: str = "default", **fixed: Any
+) -> Points:
+    """All combinations of the values in `vary`, by name: `fear_l2=0,lambda_lr=0.1`.
+
+    Args:
+      source, preset, fixed: as for `load_config`.
+      vary: values of fields of Config, `method` included.
+
+    Raises:
+      UsageError: an unknown field, or a value that does not fit.
+    """
+    points = {}
+    for values in itertools.product(*vary.values()):
+        chosen: dict[str, Any] = dict(zip(vary, values, strict=True))
+        name = ",".join(f"{k}={_word(v)}" for k, v in chosen.items()) or "point"
+        if "env" in chosen:
+            chosen["env"] = [chosen["env"]]
+        points[name] = load_config(source, preset=preset, **{**fixed, **chosen})
+    return points
+
+
+def _word(value: str) -> str:
+    """A value as it stands in a folder's name: a number the same however it was written."""
+    try:
+        return f"{float(value):.12g}"
+    except ValueError:
+        return re.sub(r"[^\w.=,+-]", "-", value)
+
+
+def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
+    """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
+    code = train_points(points, out, cache, say)
+    if code == 0:
+        say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+        say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
+    return code
+
+
+def reproduce(
+    name: str, budget: str, out: pathlib.Path, form: str = "text", cache: bool = True, say: Say = print
+) -> int:
+    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
+
+    Args:
+      name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
+
+    Raises:
+      UsageError: an unknown table or budget, or a task that cannot run here.
+    """
+    paper = table.paper()
+    for what, word, known in (("table", name, paper["tables"]), ("budget", budget, paper["budgets"])):
+        if word not in known:
+            raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
+    wanted, settings = paper["tables"][name], paper["budgets"][budget]
+    absent = [task for task in wanted["tasks"] if task not in names()]
+    if absent:
+        raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
+    plans = {task: _plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
+    for points in plans.values():
+        setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
+    for task, points in plans.items():
+        code = train_points(points, out / task, cache, say)
+        if code:
+            return code
+    rows = table.rows([out / task / point for task, points in plans.items() for point in points])
+    say(f"\n{wanted['title']}, budget '{budget}'\n")
+    say(table.render(rows, form, wanted["baseline"]))
+    return 0
+
+
+def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
+    steps = budget["steps"]
+    return grid(task, {"method": methods}, **{**budget, "steps": steps[task] if isinstance(steps, dict) else steps})
+
+
+def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
+    """Trains what is missing of `points`, each into its own folder under `out`.
+
+    Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
+
+    Returns:
+      The exit code of `experiment.train`: 0 when all points are finished.
+
+    Raises:
+      UsageError: `out` holds a point of the same name with other settings.
+    """
+    missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
+    if len(missing) < len(points):
+        say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
+    groups = list(_groups(points, missing, out))
+    for number, (folder, group) in enumerate(groups, 1):
+        first = next(iter(group.values()))
+        say(f"program {number} of {len(groups)}: {len(group)} point(s) x {first.seeds} seed(s) side by side")
+        code = _train_group(folder, group, cache, say)
+        if code:
+            return code
+        _cut(folder, group, out)
+    return 0
+
+
+def _finished(folder: pathlib.Path, config: Config) -> bool:
+    if not (folder / "config.toml").is_file():
+        return False
+    old = load_config(folder / "config.toml")
+    pairs = {f.name: (getattr(old, f.name), getattr(config, f.name)) for f in dataclasses.fields(Config)}
+    changed = ", ".join(f"{name}: {a!r} -> {b!r}" for name, (a, b) in pairs.items() if repr(a) != repr(b))
+    if changed:
+        raise UsageError(f"{folder} was made with other settings ({changed}); choose another --out")
+    return True
+
+
+def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
+    """What trains together and where: groups begun earlier that are still wanted as they are, then new ones."""
+    left = dict(missing)
+    begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
+    for folder in begun:
+        files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
+        group = {file.stem: load_config(file) for file in files}
+        if group and all(repr(points.get(name)) == repr(config) for name, config in group.items()):
+            left = {name: config for name, config in left.items() if name not in group}
+            yield folder, group
+    last = max((int(p.name.split("-")[1]) for p in begun), default=0)
+    alike: dict[str, Points] = {}
+    for name, config in sorted(left.items()):
+        traced = {f: getattr(Config, f) for f in (*TRACED, "seed")}
+        alike.setdefault(repr(dataclasses.replace(config, **traced)), {})[name] = config
+    for number, group in enumerate(alike.values(), last + 1):
+        yield out / f".group-{number}", group
+
+
+def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say) -> int:
+    """Trains the points of one program side by side, or goes on with it."""
+    try:
+        (folder / "points").mkdir(parents=True, exist_ok=True)
+        for name, config in group.items():
+            (folder / "points" / f"{name}.toml").write_text(to_toml(config))
+    except OSError as error:
+        raise UsageError(f"cannot write into {folder.parent}: {error.strerror}; choose another --out") from None
+    configs = list(group.values())
+    seeds, run = configs[0].seeds, setup(configs[0])
+    settings = [dataclasses.replace(run, config=config).hyper for config in configs]
+    own = jax.tree.map(lambda *each: jnp.repeat(jnp.stack(each), seeds), *settings)
+    seed = jnp.concatenate([jnp.arange(config.seed, config.seed + seeds) for config in configs])
+    lanes = Lanes(own if len(group) > 1 else settings[0], seed)  # settings that are shared keep the last bits of a run
+    common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
+    begun = (folder / "run" / "config.toml").is_file()
+    return experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes)
+
+
+def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
+    """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
+    _, step, saved = load_saved(folder / "run")
+    rows = read_rows(folder / "run" / "metrics.jsonl")
+    for number, (name, config) in enumerate(group.items()):
+        if (out / name).exists():
+            continue
+        first = number * config.seeds  # of its lanes
+        mine = [
+            row | {"seed": row["seed"] - first + config.seed} for row in rows if 0 <= row["seed"] - first < config.seeds
+        ]
+        part = folder / "points" / name
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        (part / "config.toml").write_text(to_toml(config))
+        (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in mine))
+        shutil.copy(folder / "run" / "versions.json", part)
+        checkpoints = Checkpoints(part)
+        checkpoints.save(step, jax.tree.map(lambda x: x[first : first + config.seeds], saved))  # noqa: B023
+        checkpoints.close()
+        part.rename(out / name)
+    shutil.rmtree(folder)

@@ -1,0 +1,90 @@
+"""A task of the user's own, given as a Python file: trained, resumed, evaluated, or refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import pytest
+
+import envs
+from pmt_jax import load_config
+
+EXAMPLE = pathlib.Path(__file__).parent.parent / "docs" / "examples" / "my_env.py"
+TINY = (
+    "--method",
+    "happo",
+    "--num-envs",
+    4,
+    "--rollout-length",
+    25,
+    "--log-interval",
+    2,
+    "--hidden",
+    8,
+    "--minibatches",
+    1,
+)
+
+
+def test_the_example_is_short():
+    assert len(EXAMPLE.read_text().splitlines()) <= 60
+
+
+def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monkeypatch):
+    out = tmp_path / "run"
+    monkeypatch.chdir(EXAMPLE.parent)
+    assert cli("train", EXAMPLE.name, *TINY, "--steps", 200, "--out", out, "--no-cache")[0] == 0
+    assert load_config(out / "config.toml").task == str(EXAMPLE)  # found again from anywhere
+    monkeypatch.chdir(tmp_path)
+    command = ("train", out / "config.toml", "--out", out, "--resume", "--steps", 400, "--no-cache")
+    assert cli(*command)[0] == 0
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [(row["step"], row["task"]) for row in rows] == [(200, "pole"), (400, "pole")]
+    assert "info/tilt" in rows[-1]
+    code, text, _ = cli("eval", out, "--episodes", 4)
+    assert code == 0 and "info/tilt" in text
+
+
+GOOD = EXAMPLE.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "says"),
+    [
+        (None, "", "there is no environment file"),
+        ("import nothing_of_that_name", "", "cannot be imported: ModuleNotFoundError: No module named 'nothing_of"),
+        ("x = (", "", "cannot be imported: SyntaxError: '(' was never closed (env.py, line 1)"),
+        ("x = 1", "", "should hold one class with reset and step (see envs/base.py), but holds none"),
+        (GOOD + "\n\nclass Other(Pole):\n    pass\n", "", "holds several (Pole, Other); choose one, as env.py:Pole"),
+        (GOOD, ":Pol", "has no class or function 'Pol'; did you mean 'Pole'?"),
+        (GOOD.replace('engine = "xla"', "pass"), "", "it has no engine"),
+        (GOOD.replace("obs_dim=3", "obs_dim=4"), "", "reset gives obs of shape (2, 3), but its spec says (2, 4)"),
+        (GOOD.replace("> 2.0, ", ", "), "", "terminated must be a bool, not float32"),
+        (
+            GOOD.replace("carry=ends", "carry=ends if isinstance(cost, float) else ends[:1]"),
+            "",
+            "step must keep what reset made, but .carry was",
+        ),
+        (
+            GOOD.replace("ends**2", "endz**2"),
+            ":Pole",
+            "step fails: NameError: name 'endz' is not defined (env.py, line ",
+        ),
+    ],
+)
+def test_files_that_cannot_be_used(text: str | None, name: str, says: str, tmp_path: pathlib.Path, cli):
+    file = tmp_path / "env.py"
+    if text is not None:
+        file.write_text(text)
+    code, out, err = cli("train", f"{file}{name}", "--out", tmp_path / "run")
+    assert code == 2 and says in err and err.count("\n") == 1 and not out
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_factory_takes_options(tmp_path: pathlib.Path):
+    file = tmp_path / "env.py"
+    file.write_text(GOOD + "\n\ndef wide(engine='xla'):\n    env = Pole()\n    env.engine = engine\n    return env\n")
+    assert envs.make(f"{file}:wide", engine="mine").engine == "mine"
+    with pytest.raises(envs.TaskError, match="has no option 'engin'; did you mean 'engine'"):
+        envs.make(f"{file}:wide", engin="mine")
