@@ -315,5 +315,5 @@ def test_reproduce_says_what_is_not_there(cli, monkeypatch, tmp_path: pathlib.Pa
 
 @pytest.mark.slow
 def test_reproduce_a_whole_table_at_the_smoke_budget(tmp_path: pathlib.Path, cli):
-    code, out, _ = cli("reproduce", "fig4", "--out", tmp_path)
+    code, out, _ = cli("reproduce", "table3", "--out", tmp_path)
     assert code == 0 and out.count("voltage_33") > 7 and out.count("voltage_141") > 7
