@@ -103,7 +103,7 @@ class Carry:
       goal_quat: [4] w first, the orientation the object should take.
       last_action: [40] both hands' clamped actions of the last step, 0 after a reset.
       joint_force: [48] N m, what motors and constraints did to each joint in the last integration step.
-      touch: [60] N and N m, the fingertip sensors' readings in the last integration step.
+      touch: [2, 5, 6] N and N m, force and torque on each fingertip in the last integration step, see `_wrenches`.
     """
 
     physics: PhysicsState
@@ -177,7 +177,7 @@ class HandOver:
             readout={
                 "motor": ("qfrc_actuator", hinges),
                 "constraint": ("qfrc_constraint", hinges),
-                "touch": ("sensordata", slice(None)),
+                "sensors": ("sensordata", slice(None)),
             },
             physics=physics,
             solver=solver,
@@ -223,9 +223,11 @@ class HandOver:
         joint_action = jnp.clip(jnp.asarray(action, before.last_action.dtype)[mask], -1.0, 1.0)  # agents in order
         low, high = self._motor_range.T
         physics, out = self._engine.step(before.physics, low + 0.5 * (joint_action + 1.0) * (high - low))
-        carry = Carry(physics, before.goal_quat, joint_action, out["motor"] + out["constraint"], out["touch"])
+        tips = _fingertips(self._chains, physics)
+        joint_force, touch = out["motor"] + out["constraint"], self._wrenches(out["sensors"], tips)
+        carry = Carry(physics, before.goal_quat, joint_action, joint_force, touch)
         cost = self._get_cost(joint_action)
-        return self._state(carry, self._get_reward(carry), cost, self._get_termination(physics))
+        return self._state(carry, tips, self._get_reward(carry), cost, self._get_termination(physics))
 
     def restore(
         self,
@@ -244,18 +246,18 @@ class HandOver:
           qvel: [54] joint velocities, the object's velocity (world frame) and spin (its own frame).
           goal_quat: [4] w first.
           last_action: [40].
-          warmstart: [54], joint_force: [48], touch: [60], see `Carry`; zero where None.
+          warmstart: [54] `qacc_warmstart`; joint_force: [48], touch: [2, 5, 6], see `Carry`. Zero where None.
         """
-        dtype = self._engine.start().qpos.dtype
-
-        def array(value: Any, size: int) -> jax.Array:
-            return jnp.zeros(size, dtype) if value is None else jnp.asarray(value, dtype)
-
-        physics = PhysicsState(array(qpos, 0), array(qvel, 0), array(warmstart, self.model.nv))
-        sensors = array(joint_force, HINGES), array(touch, self.model.nsensordata)
-        carry = Carry(physics, array(goal_quat, 0), array(last_action, 0), *sensors)
-        cost = jnp.zeros((self.spec.num_agents, 1), dtype)
-        return self._state(carry, jnp.zeros((), dtype), cost, jnp.zeros((), bool))
+        start = self._engine.start()
+        array = functools.partial(jnp.asarray, dtype=start.qpos.dtype)
+        zeros = functools.partial(jnp.zeros, dtype=start.qpos.dtype)
+        warmstart = start.warmstart if warmstart is None else array(warmstart)
+        joint_force = zeros(HINGES) if joint_force is None else array(joint_force)
+        touch = zeros((HANDS, len(FINGERS), 6)) if touch is None else array(touch)
+        physics = PhysicsState(array(qpos), array(qvel), warmstart)
+        carry = Carry(physics, array(goal_quat), array(last_action), joint_force, touch)
+        cost = zeros((self.spec.num_agents, 1))
+        return self._state(carry, _fingertips(self._chains, physics), zeros(()), cost, jnp.zeros((), bool))
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -284,12 +286,12 @@ class HandOver:
             if is_geom and self.model.geom(drawn.objid).name in CONSTRAINED:
                 drawn.rgba = np.array(COST_COLOUR, np.float32)
 
-    def _state(self, carry: Carry, reward: jax.Array, cost: jax.Array, terminated: jax.Array) -> State:
-        obs, global_state = self._get_obs(carry)
+    def _state(self, carry: Carry, tips: jax.Array, reward: jax.Array, cost: jax.Array, terminated: jax.Array) -> State:
+        obs, global_state = self._get_obs(carry, tips)
         distance, angle = _errors(carry)
         return State(obs, global_state, reward, cost, terminated, {"distance": distance, "angle": angle}, carry)
 
-    def _get_obs(self, carry: Carry) -> tuple[jax.Array, jax.Array]:
+    def _get_obs(self, carry: Carry, tips: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Observations [N, 211] and the state [398]; an agent's has its own hand's part only.
 
         A hand [187]: joint positions in their ranges, velocities and forces [24 each], each fingertip's frame [13] and
@@ -297,20 +299,19 @@ class HandOver:
         """
         physics = carry.physics
         low, high = self._joint_range.T
-        tips = _fingertips(self._chains, physics.qpos, physics.qvel)
         angles, speeds = physics.qpos[:HINGES], physics.qvel[:HINGES]
         parts = [
             (2.0 * angles - high - low) / (high - low),
             VELOCITY_SCALE * speeds,
             FORCE_SCALE * carry.joint_force,
-            _vector_last(tips),
-            FORCE_SCALE * self._wrenches(carry.touch, tips[..., 3:7]),
+            _isaac_frame(tips),
+            FORCE_SCALE * carry.touch,
             carry.last_action,
         ]
         hands = jnp.concatenate([part.reshape(HANDS, -1) for part in parts], axis=1)
         place, turn = physics.qpos[HINGES : HINGES + 3], physics.qpos[HINGES + 3 :]
         spin = VELOCITY_SCALE * _rotate(turn, physics.qvel[HINGES + 3 :])
-        thing = _vector_last(jnp.concatenate([place, turn, physics.qvel[HINGES : HINGES + 3], spin]))
+        thing = _isaac_frame(jnp.concatenate([place, turn, physics.qvel[HINGES : HINGES + 3], spin]))
         error = _multiply(turn, _conjugate(carry.goal_quat))
         goal = jnp.concatenate([jnp.asarray(GOAL, place.dtype), _xyzw(carry.goal_quat), _xyzw(error)])
         bounded = functools.partial(jnp.clip, min=-OBS_BOUND, max=OBS_BOUND)
@@ -319,13 +320,17 @@ class HandOver:
         obs = jnp.concatenate([own, jnp.broadcast_to(shared, (len(own), *shared.shape))], axis=1)
         return obs, jnp.concatenate([hands.reshape(-1), shared])
 
-    def _wrenches(self, touch: jax.Array, turns: jax.Array) -> jax.Array:
-        """Force and torque [2, 5, 6] on the fingertips in their frames: what middle links hold against, but weight."""
+    def _wrenches(self, sensors: jax.Array, tips: jax.Array) -> jax.Array:
+        """Force and torque [2, 5, 6] on the distal links in their frames, from the sensors' [60] readings.
+
+        A reading is what the middle link holds the distal one with. Its opposite less the weight, which gravity
+        compensation carries, is what contacts do to the distal link, less its own inertia.
+        """
         bodies = [[self.model.body(f"h{hand}_{name}distal").id for name in FINGERS] for hand in range(HANDS)]
         weight = self.model.body_mass[bodies][..., None] * self.model.opt.gravity  # N, [2, 5, 3]
-        force = _rotate(_conjugate(turns), jnp.asarray(weight, touch.dtype))
-        torque = jnp.cross(jnp.asarray(self.model.body_ipos[bodies], touch.dtype), force)
-        return -(touch.reshape(*turns.shape[:-1], 6) + jnp.concatenate([force, torque], axis=-1))
+        force = _rotate(_conjugate(tips[..., 3:7]), jnp.asarray(weight, sensors.dtype))
+        torque = jnp.cross(jnp.asarray(self.model.body_ipos[bodies], sensors.dtype), force)
+        return -(sensors.reshape(HANDS, len(FINGERS), 6) + jnp.concatenate([force, torque], axis=-1))
 
     def _get_reward(self, carry: Carry) -> jax.Array:
         """[] in (0, 1]: exp(-10 d - 0.2 theta), the object being d (m) away from the goal and turned by theta (rad)."""
@@ -388,7 +393,7 @@ def _xyzw(q: jax.Array) -> jax.Array:
     return jnp.roll(q, -1, axis=-1)
 
 
-def _vector_last(frame: jax.Array) -> jax.Array:
+def _isaac_frame(frame: jax.Array) -> jax.Array:
     """A frame [..., 13] of position, quaternion, velocity and spin with the quaternion in Isaac Gym's order."""
     return jnp.concatenate([frame[..., :3], _xyzw(frame[..., 3:7]), frame[..., 7:]], axis=-1)
 
@@ -423,11 +428,12 @@ def _chains(model: mujoco.MjModel) -> _Chains:
     return _Chains(model.body_pos[bodies], model.body_quat[bodies], axis, model.jnt_dofadr[joint])
 
 
-def _fingertips(chains: _Chains, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def _fingertips(chains: _Chains, physics: PhysicsState) -> jax.Array:
     """Frames [2, 5, 13] of the distal links at their joints: position, quaternion, velocity and spin, world frame.
 
     Engines leave these a substep behind qpos; here they belong to it, also where no step led.
     """
+    qpos, qvel = physics.qpos, physics.qvel
     shape = chains.dof.shape[1:]
     nothing = jnp.zeros((*shape, 3), qpos.dtype)
     unturned = jnp.zeros((*shape, 4), qpos.dtype).at[..., 0].set(1.0)

@@ -120,6 +120,8 @@ def test_reset_draws_what_the_task_says():
         np.testing.assert_allclose(turn[:, 0] * turn[:, 3], turn[:, 1] * turn[:, 2], atol=1e-6)
         np.testing.assert_allclose((turn**2).mean(axis=0), 0.25, atol=0.03)
     assert not np.asarray(state.carry.physics.qvel).any()
+    sensed = np.asarray(state.obs)[:, :, [*range(48, 72), *range(137, 167)]]
+    assert not sensed.any() and not np.asarray(state.obs)[:, :, 167:187].any()  # no forces, no last action yet
 
 
 def test_observation_layout():
