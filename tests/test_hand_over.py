@@ -238,7 +238,7 @@ def holding():
 def test_still_half_flexed_hands_keep_the_egg_until_time_cuts_the_episode(holding):
     _, outcome = holding
     assert not outcome.terminated.any() and not outcome.truncated[:74].any() and outcome.truncated[74].all()
-    np.testing.assert_allclose(outcome.reward.sum(axis=0).mean(), 4, atol=1)  # what learning has to beat
+    np.testing.assert_allclose(outcome.reward.sum(axis=0).mean(), 3.4, atol=0.3)  # what learning has to beat
 
 
 def test_contacts_at_rest_are_no_deeper_than_3_mm(holding):
