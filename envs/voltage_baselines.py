@@ -18,7 +18,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .base import State
 from .voltage_control import VoltageControl
@@ -113,31 +112,3 @@ def q_to_action(env: VoltageControl, state: State, q: jax.Array) -> jax.Array:
     """[N, 1] the action that sets reactive powers `q` [N] MVAr in the next step; beyond [-1, 1] where it cannot."""
     limit = env.scenario.action_scale * env.q_limit(state.carry.row)
     return (q / jnp.maximum(limit, 1e-9))[:, None]
-
-
-def evaluate(
-    env: VoltageControl, policy: Policy, key: jax.Array, episodes: int = 64, chunk: int = 64
-) -> dict[str, float]:
-    """Means of all metrics, reward and cost over the steps of `episodes`; an episode that collapses ends there."""
-
-    def step(c: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], dict[str, jax.Array]]:
-        state, alive = c
-        after = env.step(state, policy(state))
-        seen = {
-            **after.info,
-            "reward": after.reward,
-            "cost": jnp.mean(after.cost),
-            "steps": jnp.ones_like(after.reward),
-        }
-        return (after, alive & ~after.terminated), {k: jnp.where(alive, v, 0) for k, v in seen.items()}
-
-    def episode(key: jax.Array) -> dict[str, jax.Array]:
-        _, seen = jax.lax.scan(step, (env.reset(key), jnp.asarray(True)), None, env.spec.horizon)
-        return jax.tree.map(lambda x: jnp.sum(x, axis=0), seen)
-
-    run = jax.jit(lambda keys: jax.tree.map(jnp.sum, jax.vmap(episode)(keys)))
-    keys = jax.random.split(key, episodes)
-    sums = [run(keys[i : i + chunk]) for i in range(0, episodes, chunk)]
-    total = {k: float(np.sum([s[k] for s in sums])) for k in sums[0]}
-    steps = total.pop("steps")
-    return {k: v / steps for k, v in total.items()}

@@ -47,8 +47,8 @@ class Hyper:
       regret_l2: the same for regret.
       temperature: of the relaxed samples of the gumbel fear losses.
       omega: share of an action's entries whose regret counts, or the threshold of regret from which it counts.
-      regret_max: regret is cut here before it weighs on the ratio.
-      kappa: the weight stays within 1 +- kappa * clip; inf for no bound.
+      regret_max: regret is cut here; where it weighs on the cost advantage, by at most 1 / (1 - regret_max).
+      kappa: the weight on the ratio stays within 1 +- kappa * clip; inf for no bound.
       kl_limit: size of MACPO's trust region, mean KL in nats.
       damping: added to the Fisher matrix.
       first_step: first step of MACPO's line search, as a share of the full step.

@@ -99,18 +99,11 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 Critics.
-    critic, critic_metrics = _fit_critic(
-        run, hyper, state.critic, run.nets.value, batch.state, value, returns, tagged[Tag.CRITIC]
-    )
-    cost_critic, cost_critic_metrics = _fit_critic(
-        run,
-        hyper,
-        state.cost_critic,
-        run.nets.cost_value,
-        batch.state,
-        cost_value,
-        cost_returns,
-        tagged[Tag.COST_CRITIC],
+    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    fit_critic = functools.partial(_fit_critic, run, hyper)
+    critic, critic_metrics = fit_critic(state.critic, run.nets.value, rows, tagged[Tag.CRITIC])
+    cost_critic, cost_critic_metrics = fit_critic(
+        state.cost_critic, run.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]
     )
 
     # 5 Coping response: every agent's policy, and the price of danger.
@@ -197,7 +190,8 @@ def _appraise_regret(
     """Learns how deliberate the costly actions were, then weighs every step's ratio by how regret has changed.
 
     Returns:
-      the networks of all agents, log w [T, B, N] (0 without regret), and metrics.
+      the networks of all agents, log w [T, B, N] (0 without regret), and metrics: mean regret per action entry on
+      costly steps, what it would be on safe ones were they costly, and the weight w over all rows.
     """
     if net is None:
         return None, jnp.zeros_like(batch.log_prob), {}
@@ -225,8 +219,11 @@ def _appraise_regret(
     learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
     after = logits(learned.params, state, batch.action)
     new, old = appraisal.regret(after, batch.cost), appraisal.regret(before, batch.cost)
+    bound = hyper.kappa * hyper.clip
     if run.config.regret_response != "letter":  # the other responses answer to regret itself, not to its change
         old = jnp.zeros_like(new)
+    if run.config.regret_response == "advantage":  # no ratio is touched, so there is no clip interval to leave
+        bound = hyper.regret_max
     log_weight = regret_weight(
         new,
         old,
@@ -234,20 +231,16 @@ def _appraise_regret(
         choose=run.config.regret_mask,
         omega=hyper.omega,
         regret_max=hyper.regret_max,
-        bound=hyper.kappa * hyper.clip,
+        bound=bound,
     )
     weight = jnp.exp(log_weight)
-    felt = (new * mask).sum() / jnp.maximum(costly.sum(), 1)
-    return (
-        net,
-        log_weight,
-        {
-            **{k: x.mean(0) for k, x in metrics.items()},
-            "on_costly": felt,
-            "weight_mean": weight.mean(),
-            "weight_std": weight.std(),
-        },
-    )
+    diagnostics = {
+        "on_costly": (new * mask).sum() / costly.sum(),
+        "on_safe": (jax.nn.sigmoid(after) * (mask - costly)).sum() / (mask - costly).sum(),
+        "weight_mean": weight.mean(),
+        "weight_std": weight.std(),
+    }
+    return learned, log_weight, {**{k: x.mean(0) for k, x in metrics.items()}, **diagnostics}
 
 
 def _appraisal_passes(run: Run, hyper: Hyper) -> dict[str, Any]:
@@ -287,14 +280,17 @@ def _fit_critic(
     hyper: Hyper,
     critic: Critic,
     value_fn: ValueFn,
-    state: jax.Array,
-    old_value: jax.Array,
-    returns: jax.Array,
+    rows: tuple[jax.Array, jax.Array, jax.Array],
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:
-    """Updates the moments of the returns once, then fits the critic to them in the new units."""
+    """Updates the moments of the returns once, then fits the critic to them in the new units.
+
+    Args:
+      rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+    """
+    state, old_value, returns = rows
     moments = normalise.forget(critic.returns, returns, hyper.value_decay)
-    rows = (state, normalise.normalise(moments, old_value), normalise.normalise(moments, returns))
+    normalised = (state, normalise.normalise(moments, old_value), normalise.normalise(moments, returns))
 
     def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, old, target = minibatch
@@ -302,6 +298,6 @@ def _fit_critic(
 
     passes = {"epochs": run.config.epochs, "minibatches": run.config.minibatches}
     limits = {"learning_rate": hyper.critic_lr, "max_grad_norm": hyper.max_grad_norm}
-    net, metrics = fit(critic.net, loss, jax.tree.map(_flat, rows), key, **limits, **passes)
+    net, metrics = fit(critic.net, loss, jax.tree.map(_flat, normalised), key, **limits, **passes)
     unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
     return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from scipy import stats
 from pmt_jax import distributions, dual, normalise
 from pmt_jax.coping import clipped_surrogate, hybrid_advantage
 from pmt_jax.fit import fit, huber, untrained, value_loss
+from pmt_jax.networks import LayerNorm
 from pmt_jax.returns import gae, standardise
 
 
@@ -215,3 +217,9 @@ def test_fit_scales_gradients_down_to_the_given_norm():
     # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
     np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)
     np.testing.assert_allclose(metrics["grad_norm"], 2e6, rtol=1e-5)
+
+
+def test_layer_normalisation_is_what_its_name_says():
+    x = 3 * jax.random.normal(jax.random.key(0), (7, 33)) + 2
+    weights = {"params": {"scale": jnp.arange(33.0) / 10, "bias": jnp.arange(33.0)}}
+    np.testing.assert_allclose(LayerNorm().apply(weights, x), nn.LayerNorm().apply(weights, x), atol=2e-5)

@@ -1,0 +1,94 @@
+"""Responses to regret at equal budget: does any of them lower cost at equal reward, and can Mixed beat its parts?
+
+    python -m bench.responses lane switch noisy --out bench/results/responses_toys.json     ten minutes on two cores
+    python -m bench.responses ant_2x4 --steps 3e5 --out bench/results/responses_ant.json    half an hour
+    python -m bench.responses --from bench/results/responses_toys.json                      prints the table
+
+Five seeds, the stochastic policy. Figures are per horizon (25 steps on the toys, 1,000 on the ant): costly steps over
+the last eighth of training and over all of it, reward over the last eighth; means and 95 % bootstrap intervals.
+MAPPO-Lagrangian with faster multipliers is there because a response that only adds to the price is no discovery.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from pmt_jax import load_config, setup
+
+from .search import search
+from .toys import SIZES, interval
+
+SEEDS = 5
+FASTER = (2.0, 4.0, 8.0)  # times the task's lambda_lr
+ADVANTAGE = {"regret_response": "advantage", "regret_max": 0.8}
+CONTESTANTS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("mappo_l", {}),
+    ("r4sg", {}),
+    ("r4sg", {"regret_response": "one_sided"}),
+    ("r4sg", ADVANTAGE),
+    ("f4sg", {}),
+    ("mixed", {}),
+    ("mixed", ADVANTAGE),
+)
+
+
+def measure(task: str, method: str, changes: dict[str, Any], faster: tuple[float, ...]) -> list[dict[str, Any]]:
+    """One row per multiplier step: the task's own `lambda_lr` times each of `faster`, all seeds in one program."""
+    config = load_config(task, method=method, seeds=SEEDS, **changes)
+    rates = [config.lambda_lr * times for times in faster]
+    found = search({f"lambda_lr={rate:g}": config.replace(lambda_lr=rate) for rate in rates}, episodes=0)
+    horizon = setup(config).vector.horizon
+    costly = horizon * np.asarray(found["curves"]["violation_rate"], float)
+    reward = horizon * np.asarray(found["curves"]["step_reward"], float)
+    last = max(1, len(costly) // 8)
+    rows = []
+    for i, rate in enumerate(rates):
+        mine = slice(i * SEEDS, (i + 1) * SEEDS)
+        figures = {"cost": costly[-last:, mine], "cost_all": costly[:, mine], "reward": reward[-last:, mine]}
+        means = {name: x.mean(0).round(4).tolist() for name, x in figures.items()}
+        told = changes | ({"lambda_lr": round(rate, 4)} if rate != config.lambda_lr else {})
+        rows.append({"task": task, "method": method, "changes": told, "steps": found["steps"][-1], **means})
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = ["| task | method | cost at the end | cost while training | reward at the end |", "|---|---|---|---|---|"]
+    for row in rows:
+        changes = "".join(f", {k} = {v}" for k, v in row["changes"].items() if k not in ("steps", "num_envs"))
+        figures = " | ".join(interval(row[name], 2) for name in ("cost", "cost_all", "reward"))
+        lines.append(f"| {row['task']} | {row['method']}{changes} | {figures} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tasks", nargs="*")
+    parser.add_argument("--steps")
+    parser.add_argument("--out", type=pathlib.Path)
+    parser.add_argument("--from", dest="source", type=pathlib.Path)
+    arguments = parser.parse_args()
+    if arguments.source:
+        print(table(json.loads(arguments.source.read_text())["rows"]))
+        return
+    rows = []
+    for task in arguments.tasks:
+        size = {**SIZES.get(task, {}), **({"steps": arguments.steps} if arguments.steps else {})}
+        for method, changes in CONTESTANTS:
+            faster = (1.0, *FASTER) if method == "mappo_l" and task in SIZES else (1.0,)
+            new = measure(task, method, {**size, **changes}, faster)
+            rows += new
+            print(*table(new).splitlines()[2:], sep="\n", flush=True)
+            if arguments.out:
+                versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
+                arguments.out.write_text(json.dumps({"versions": versions, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
