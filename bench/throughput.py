@@ -72,17 +72,17 @@ def plain_loop(steps: int) -> float:
     return steps / (time.perf_counter() - begin)
 
 
-def plain_loops_at_once(threads: int, steps: int) -> float:
+def at_once(loop: Callable[[int], float], threads: int, steps: int) -> float:
     """Control steps/s of `threads` plain loops together; MuJoCo releases the interpreter lock while it steps."""
     begin = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(plain_loop, [steps] * threads))
+        list(pool.map(loop, [steps] * threads))
     return threads * steps / (time.perf_counter() - begin)
 
 
-def env_alone(batch: int, steps: int, **options: Any) -> Measure:
-    """jit(scan(vmap(step))) with random actions, and resets where an ant's episode ends."""
-    env = envs.make("ant_2x4", **options)
+def env_alone(batch: int, steps: int, task: str = "ant_2x4", **options: Any) -> Measure:
+    """jit(scan(vmap(step))) with random actions, and resets where an episode terminates."""
+    env = envs.make(task, **options)
     spec = env.spec
 
     def step(state, action_and_key):
@@ -144,7 +144,7 @@ def compare(batches: list[int], engines: list[str], repeats: int, seconds: float
     threads, count = usable_cpus(), int(ROUGH["mujoco"] * seconds)
     measures: dict[str, Measure] = {
         "plain loop": lambda: plain_loop(count),
-        "plain loops at once": lambda: plain_loops_at_once(threads, count),
+        "plain loops at once": lambda: at_once(plain_loop, threads, count),
     }
     for engine in [*engines, "training"]:
         for batch in batches:
@@ -154,6 +154,12 @@ def compare(batches: list[int], engines: list[str], repeats: int, seconds: float
             options = {"solver": solver} if solver else {}
             measures[f"{engine} B={batch}"] = make(batch, steps, **options)
             print(f"compiled {engine} B={batch}", file=sys.stderr)
+    return interleaved(measures, repeats, patience)
+
+
+def interleaved(measures: dict[str, Measure], repeats: int, patience: float) -> list[Any]:
+    """A row for each of `measures`, among them "plain loop" and "plain loops at once", which the others relate to."""
+    threads = usable_cpus()
     found: dict[str, list[float]] = {name: [] for name in measures}
     others: dict[str, list[float]] = {name: [] for name in measures}
     for _ in range(repeats):
@@ -270,6 +276,18 @@ def machine() -> dict[str, Any]:
     return {"cpu": cpu, "threads": usable_cpus(), "memory_gb": round(memory), "system": platform.platform()}
 
 
+def conditions(args: argparse.Namespace) -> dict[str, Any]:
+    """Where, when and with what a benchmark runs: the beginning of its report."""
+    return {
+        "machine": machine(),
+        "versions": {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__},
+        "commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain", "-uno") else ""),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "load_average": {"begin": os.getloadavg()},
+        "settings": {key: value for key, value in vars(args).items() if key != "out"},
+    }
+
+
 def _git(*words: str) -> str:
     here = pathlib.Path(__file__).parent
     return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=False).stdout.strip()
@@ -305,14 +323,7 @@ def main() -> None:
     args = parser.parse_args()
     batches = [16, 64] if args.quick else [16, 64, 256]
     engines = ["mujoco"] if args.quick else ["mujoco", "mjx converged", "mjx fast"]
-    report: dict[str, Any] = {
-        "machine": machine(),
-        "versions": {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__},
-        "commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain", "-uno") else ""),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "load_average": {"begin": os.getloadavg()},
-        "settings": {key: value for key, value in vars(args).items() if key != "out"},
-    }
+    report = conditions(args)
     if not args.quick:  # first, while this process holds no programs
         report["starts"], report["memory"] = starts(6 * args.patience), memory()
     report["rates"] = compare(batches, engines, args.repeats, args.seconds, args.patience)

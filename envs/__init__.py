@@ -22,6 +22,10 @@ __pmt__ = "pmt-jax"  # tells our `envs` from the unrelated package of that name 
 _TASKS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "ant_2x4": ("ant_corridor", "AntCorridor", {"num_agents": 2}),
     "ant_4x2": ("ant_corridor", "AntCorridor", {"num_agents": 4}),
+    "hand_over_2x6": ("hand_over", "HandOver", {"variant": "2x6"}),
+    "hand_over_4x3": ("hand_over", "HandOver", {"variant": "4x3"}),
+    "hand_over_safe_joint": ("hand_over", "HandOver", {"variant": "safe_joint"}),
+    "hand_over_safe_finger": ("hand_over", "HandOver", {"variant": "safe_finger"}),
     "lane": ("toys", "Lane", {}),
     "switch": ("toys", "Switch", {}),
     "noisy": ("toys", "Noisy", {}),
