@@ -22,7 +22,7 @@ from envs import host_call
 ROOT = Path(__file__).parents[1]
 
 
-def run(script: str, timeout: float = 120.0, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(script: str, timeout: float = 240.0, **environment: str) -> subprocess.CompletedProcess[str]:
     """A script in a process of its own; one that hangs fails."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     env = {**os.environ, **environment}

@@ -43,7 +43,7 @@ def assert_same(a, b) -> None:
         np.testing.assert_array_equal(x, y)
 
 
-def run(script: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+def run(script: str, timeout: float = 180.0) -> subprocess.CompletedProcess[str]:
     """A script in a process of its own, with a working directory that is not written to."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
