@@ -1,7 +1,8 @@
 """Responses to regret at equal budget: does any of them lower cost at equal reward, and can Mixed beat its parts?
 
     python -m bench.responses lane switch noisy --out bench/results/responses_toys.json     ten minutes on two cores
-    python -m bench.responses ant_2x4 --steps 3e5 --out bench/results/responses_ant.json    half an hour
+    python -m bench.responses ant_2x4 --steps 3e5 --faster 4 --methods mappo_l r4sg f4sg \\
+        --out bench/results/responses_ant.json                                              half an hour
     python -m bench.responses --from bench/results/responses_toys.json                      prints the table
 
 Five seeds, the stochastic policy. Figures are per horizon (25 steps on the toys, 1,000 on the ant): costly steps over
@@ -25,7 +26,6 @@ from .search import search
 from .toys import SIZES, interval
 
 SEEDS = 5
-FASTER = (2.0, 4.0, 8.0)  # times the task's lambda_lr
 ADVANTAGE = {"regret_response": "advantage", "regret_max": 0.8}
 CONTESTANTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("mappo_l", {}),
@@ -71,6 +71,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*")
     parser.add_argument("--steps")
+    parser.add_argument("--methods", nargs="+", default=["mappo_l", "r4sg", "f4sg", "mixed"])
+    parser.add_argument("--faster", nargs="+", type=float, default=[2.0, 4.0, 8.0], help="times the task's lambda_lr")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
@@ -81,7 +83,9 @@ def main() -> None:
     for task in arguments.tasks:
         size = {**SIZES.get(task, {}), **({"steps": arguments.steps} if arguments.steps else {})}
         for method, changes in CONTESTANTS:
-            faster = (1.0, *FASTER) if method == "mappo_l" and task in SIZES else (1.0,)
+            if method not in arguments.methods:
+                continue
+            faster = (1.0, *arguments.faster) if method == "mappo_l" else (1.0,)
             new = measure(task, method, {**size, **changes}, faster)
             rows += new
             print(*table(new).splitlines()[2:], sep="\n", flush=True)

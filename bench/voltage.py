@@ -51,13 +51,14 @@ def given(policy: str) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = ["| policy | CR | PL, MW | episode reward | episode cost |", "|---|---|---|---|---|"]
+    lines = ["| policy | steps a seed | CR | PL, MW | episode reward | episode cost |", "|---|---|---|---|---|---|"]
     for row in rows:
         cells = [
             f"{row[name][0]:.3f}" if len(row[name]) == 1 else interval(row[name], 3)
             for name in ("CR", "PL", "reward", "cost")
         ]
-        lines.append(f"| {row['policy']} | {' | '.join(cells)} |")
+        steps = f"{row['steps']:,}" if "steps" in row else "-"
+        lines.append(f"| {row['policy']} | {steps} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
