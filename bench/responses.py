@@ -52,7 +52,8 @@ def measure(task: str, method: str, changes: dict[str, Any], faster: tuple[float
         mine = slice(i * SEEDS, (i + 1) * SEEDS)
         figures = {"cost": costly[-last:, mine], "cost_all": costly[:, mine], "reward": reward[-last:, mine]}
         means = {name: x.mean(0).round(4).tolist() for name, x in figures.items()}
-        told = changes | ({"lambda_lr": round(rate, 4)} if rate != config.lambda_lr else {})
+        told = {k: v for k, v in changes.items() if k not in ("steps", "num_envs")}
+        told |= {"lambda_lr": round(rate, 4)} if rate != config.lambda_lr else {}
         rows.append({"task": task, "method": method, "changes": told, "steps": found["steps"][-1], **means})
     return rows
 
@@ -61,7 +62,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = ["| task | method | cost at the end | cost while training | reward at the end |", "|---|---|---|---|---|"]
     for row in rows:
-        changes = "".join(f", {k} = {v}" for k, v in row["changes"].items() if k not in ("steps", "num_envs"))
+        changes = "".join(f", {k} = {v}" for k, v in row["changes"].items())
         figures = " | ".join(interval(row[name], 2) for name in ("cost", "cost_all", "reward"))
         lines.append(f"| {row['task']} | {row['method']}{changes} | {figures} |")
     return "\n".join(lines)
