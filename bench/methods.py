@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import time
@@ -21,6 +20,8 @@ from typing import Any
 import jax
 
 from pmt_jax import METHODS, learner, load_config, setup
+
+from . import records
 
 REFERENCE = "mappo_l"
 SIZE = {"num_envs": 64, "rollout_length": 64, "epochs": 5, "minibatches": 8, "hidden": (128, 128), "log_interval": 1}
@@ -100,15 +101,14 @@ def main() -> None:
     parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
     if arguments.source:
-        print(table(json.loads(arguments.source.read_text())["rows"]))
+        print(table(records.read(arguments.source)))
         return
     rows = []
     for task in TASKS:
         rows += measure(task, arguments.rounds)
         print(table(rows), flush=True)
     if arguments.out:
-        versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
-        arguments.out.write_text(json.dumps({"versions": versions, "rows": rows}, indent=1) + "\n")
+        records.write(arguments.out, rows)
 
 
 if __name__ == "__main__":

@@ -13,15 +13,14 @@ MAPPO-Lagrangian with faster multipliers is there because a response that only a
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 from typing import Any
 
-import jax
 import numpy as np
 
 from pmt_jax import load_config, setup
 
+from . import records
 from .search import search
 from .toys import SIZES, interval
 
@@ -78,7 +77,7 @@ def main() -> None:
     parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
     if arguments.source:
-        print(table(json.loads(arguments.source.read_text())["rows"]))
+        print(table(records.read(arguments.source)))
         return
     rows = []
     for task in arguments.tasks:
@@ -91,8 +90,7 @@ def main() -> None:
             rows += new
             print(*table(new).splitlines()[2:], sep="\n", flush=True)
             if arguments.out:
-                versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
-                arguments.out.write_text(json.dumps({"versions": versions, "rows": rows}, indent=1) + "\n")
+                records.write(arguments.out, rows)
 
 
 if __name__ == "__main__":

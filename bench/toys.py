@@ -10,7 +10,6 @@ and 100 elsewhere; figures are means over the last 15 updates of the stochastic 
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import time
 from typing import Any
@@ -21,6 +20,8 @@ import numpy as np
 
 from pmt_jax import METHODS, load_config, make_train
 from pmt_jax.statistics import bootstrap_interval
+
+from . import records
 
 SEEDS = 5
 LAST = 15
@@ -70,7 +71,7 @@ def main() -> None:
     parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
     if arguments.source:
-        print(table(json.loads(arguments.source.read_text())["rows"]))
+        print(table(records.read(arguments.source)))
         return
     rows = []
     for task in SIZES:
@@ -80,8 +81,7 @@ def main() -> None:
     rows.append(measure("switch", "f4sg", fear_time="current"))
     rows.append(measure("noisy", "f4sg", fear_loss="gumbel_rev"))
     if arguments.out:
-        versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
-        arguments.out.write_text(json.dumps({"versions": versions, "rows": rows}, indent=1) + "\n")
+        records.write(arguments.out, rows)
 
 
 if __name__ == "__main__":

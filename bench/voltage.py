@@ -10,16 +10,14 @@ CR: controllable rate, the share of steps with every bus in the band. PL: losses
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import time
 from typing import Any
 
-import jax
-
 from pmt_jax import METHODS, load_config
 from pmt_jax.experiment import evaluate_baseline
 
+from . import records
 from .search import search
 from .toys import interval
 
@@ -71,7 +69,7 @@ def main() -> None:
     parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
     arguments = parser.parse_intermixed_args()
     if arguments.source:
-        print(table(json.loads(arguments.source.read_text())["rows"]))
+        print(table(records.read(arguments.source)))
         return
     changes = dict(pair.split("=", 1) for pair in arguments.fixed)
     rows = [given(policy) for policy in ("zero", "droop", "opf")]
@@ -80,8 +78,7 @@ def main() -> None:
         rows.append(learned(method, arguments.steps, **changes))
         print(table(rows[-1:]).splitlines()[-1], rows[-1]["seconds"], "s", flush=True)
         if arguments.out:
-            versions = {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
-            arguments.out.write_text(json.dumps({"versions": versions, "changes": changes, "rows": rows}) + "\n")
+            records.write(arguments.out, rows, changes=changes)
 
 
 if __name__ == "__main__":

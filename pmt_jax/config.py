@@ -174,6 +174,12 @@ class Config(Hyper):
         return dataclasses.replace(self, **{k: convert(k, v) for k, v in changes.items()})
 
 
+def differences(old: Config, new: Config) -> dict[str, str]:
+    """{field: 'old -> new'} of the settings that are not the same; a nan is the same as a nan."""
+    pairs = {f.name: (repr(getattr(old, f.name)), repr(getattr(new, f.name))) for f in dataclasses.fields(Config)}
+    return {name: f"{a} -> {b}" for name, (a, b) in pairs.items() if a != b}
+
+
 FIELDS: dict[str, Any] = typing.get_type_hints(Config)
 HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib.metadata
 import json
@@ -18,7 +17,7 @@ import numpy as np
 
 from . import learner
 from .checkpoint import Checkpoints
-from .config import Config, load_config, to_toml
+from .config import Config, differences, load_config, to_toml
 from .errors import UsageError
 from .files import read_rows, replace_text
 from .run import Run, setup
@@ -60,10 +59,9 @@ def open_folder(out: pathlib.Path, run: Run, resume: bool, say: Say) -> None:
 
 def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
     """Only `steps` may change when a run is continued."""
-    fields = [f.name for f in dataclasses.fields(Config) if f.name != "steps"]
-    changed = [f for f in fields if repr(getattr(old, f)) != repr(getattr(new, f))]
+    changed = {name: change for name, change in differences(old, new).items() if name != "steps"}
     if changed:
-        difference = "".join(f"\n  {f}: {getattr(old, f)!r} -> {getattr(new, f)!r}" for f in changed)
+        difference = "".join(f"\n  {name}: {change}" for name, change in changed.items())
         raise UsageError(
             f"the run in {out} was made with other settings; resume it unchanged (only --steps may grow), or choose "
             f"another --out:{difference}"

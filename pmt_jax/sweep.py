@@ -20,9 +20,10 @@ import jax.numpy as jnp
 
 from . import experiment, table
 from .checkpoint import Checkpoints
-from .config import HYPER_FIELDS, Config, load_config, to_toml
+from .config import HYPER_FIELDS, Config, differences, load_config, to_toml
 from .errors import UsageError
-from .folder import Say, load_saved, read_rows
+from .files import read_rows
+from .folder import Say, load_saved
 from .methods import METHODS
 from .run import Lanes, setup
 from .tasks import did_you_mean, names
@@ -137,9 +138,8 @@ def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: Say
 def _finished(folder: pathlib.Path, config: Config) -> bool:
     if not (folder / "config.toml").is_file():
         return False
-    old = load_config(folder / "config.toml")
-    pairs = {f.name: (getattr(old, f.name), getattr(config, f.name)) for f in dataclasses.fields(Config)}
-    changed = ", ".join(f"{name}: {a!r} -> {b!r}" for name, (a, b) in pairs.items() if repr(a) != repr(b))
+    changes = differences(load_config(folder / "config.toml"), config)
+    changed = ", ".join(f"{name}: {change}" for name, change in changes.items())
     if changed:
         raise UsageError(f"{folder} was made with other settings ({changed}); choose another --out")
     return True

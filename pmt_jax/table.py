@@ -21,6 +21,7 @@ import numpy as np
 from . import statistics
 from .config import Config, load_config
 from .errors import UsageError
+from .files import read_rows
 from .methods import METHODS
 from .tasks import did_you_mean
 
@@ -122,8 +123,7 @@ def rows(folders: Sequence[pathlib.Path]) -> list[Row]:
 
 
 def _read(folder: pathlib.Path) -> _Found:
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    log = [json.loads(line) for line in lines if line.endswith("}")]  # a running run may be cut off in mid-line
+    log = read_rows(folder / "metrics.jsonl", missing_ok=False)
     if not log:
         raise UsageError(f"{folder} has no figures yet: its metrics.jsonl is empty")
     last = log[-1]
