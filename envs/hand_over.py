@@ -227,7 +227,8 @@ class HandOver:
         joint_force, touch = out["motor"] + out["constraint"], self._wrenches(out["sensors"], tips)
         carry = Carry(physics, before.goal_quat, joint_action, joint_force, touch)
         cost = self._get_cost(joint_action)
-        return self._state(carry, tips, self._get_reward(carry), cost, self._get_termination(physics))
+        outcome = self._get_reward(carry), cost, self._get_termination(physics)
+        return self._state(carry, tips, *outcome, out["overflow"])
 
     def restore(
         self,
@@ -257,7 +258,8 @@ class HandOver:
         physics = PhysicsState(array(qpos), array(qvel), warmstart)
         carry = Carry(physics, array(goal_quat), array(last_action), joint_force, touch)
         cost = zeros((self.spec.num_agents, 1))
-        return self._state(carry, _fingertips(self._chains, physics), zeros(()), cost, jnp.zeros((), bool))
+        outcome = zeros(()), cost, jnp.zeros((), bool)
+        return self._state(carry, _fingertips(self._chains, physics), *outcome, zeros(()))
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -286,10 +288,19 @@ class HandOver:
             if is_geom and self.model.geom(drawn.objid).name in CONSTRAINED:
                 drawn.rgba = np.array(COST_COLOUR, np.float32)
 
-    def _state(self, carry: Carry, tips: jax.Array, reward: jax.Array, cost: jax.Array, terminated: jax.Array) -> State:
+    def _state(
+        self,
+        carry: Carry,
+        tips: jax.Array,
+        reward: jax.Array,
+        cost: jax.Array,
+        terminated: jax.Array,
+        overflow: jax.Array,
+    ) -> State:
         obs, global_state = self._get_obs(carry, tips)
         distance, angle = _errors(carry)
-        return State(obs, global_state, reward, cost, terminated, {"distance": distance, "angle": angle}, carry)
+        info = {"distance": distance, "angle": angle, "physics_overflow": overflow}
+        return State(obs, global_state, reward, cost, terminated, info, carry)
 
     def _get_obs(self, carry: Carry, tips: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Observations [N, 211] and the state [398]; an agent's has its own hand's part only.
@@ -399,8 +410,8 @@ def _isaac_frame(frame: jax.Array) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Chains:
-    """The bodies from the world to each fingertip, padded in front to the longest: arrays [level, hand, finger, ...].
+class _Links:
+    """Bodies one below the other, side by side for several hands or fingers: arrays [level, ...].
 
     offset, turn: of a body in its parent; axis: of its hinge in its own frame (0 where it has none); dof: the hinge's.
     """
@@ -411,44 +422,59 @@ class _Chains:
     dof: np.ndarray
 
 
-def _chains(model: mujoco.MjModel) -> _Chains:
-    chains = []
-    for hand in range(HANDS):
-        for finger in FINGERS:
-            body, chain = model.body(f"h{hand}_{finger}distal").id, []
-            while body:
-                chain.insert(0, body)
-                body = int(model.body_parentid[body])
-            chains.append(chain)
-    longest = max(map(len, chains))
-    bodies = np.array([[0] * (longest - len(chain)) + chain for chain in chains])  # the world has no offset
-    bodies = bodies.T.reshape(longest, HANDS, len(FINGERS))
+def _chains(model: mujoco.MjModel) -> tuple[_Links, _Links]:
+    """The bodies from the world to the palms [level, hand], and on to the fingertips [level, hand, finger], where
+    shorter fingers begin with a body that stays where it is."""
+    palms = [_ancestry(model, model.body(f"h{hand}_palm").id) for hand in range(HANDS)]
+    tips = [
+        [_ancestry(model, model.body(f"h{hand}_{name}distal").id)[len(palms[hand]) :] for name in FINGERS]
+        for hand in range(HANDS)
+    ]
+    longest = max(len(tip) for hand in tips for tip in hand)
+    padded = [[[0] * (longest - len(tip)) + tip for tip in hand] for hand in tips]  # the world has no offset
+    return _links(model, np.moveaxis(np.array(palms), -1, 0)), _links(model, np.moveaxis(np.array(padded), -1, 0))
+
+
+def _ancestry(model: mujoco.MjModel, body: int) -> list[int]:
+    """The bodies from the world's child to `body`."""
+    return [*_ancestry(model, int(model.body_parentid[body])), body] if body else []
+
+
+def _links(model: mujoco.MjModel, bodies: np.ndarray) -> _Links:
     hinged, joint = model.body_jntnum[bodies] > 0, np.maximum(model.body_jntadr[bodies], 0)
     axis = np.where(hinged[..., None], model.jnt_axis[joint], 0.0)
-    return _Chains(model.body_pos[bodies], model.body_quat[bodies], axis, model.jnt_dofadr[joint])
+    return _Links(model.body_pos[bodies], model.body_quat[bodies], axis, model.jnt_dofadr[joint])
 
 
-def _fingertips(chains: _Chains, physics: PhysicsState) -> jax.Array:
+_Frame = tuple[jax.Array, ...]  # place, quaternion, velocity and spin in the world
+
+
+def _fingertips(chains: tuple[_Links, _Links], physics: PhysicsState) -> jax.Array:
     """Frames [2, 5, 13] of the distal links at their joints: position, quaternion, velocity and spin, world frame.
 
     Engines leave these a substep behind qpos; here they belong to it, also where no step led.
     """
-    qpos, qvel = physics.qpos, physics.qvel
-    shape = chains.dof.shape[1:]
-    nothing = jnp.zeros((*shape, 3), qpos.dtype)
-    unturned = jnp.zeros((*shape, 4), qpos.dtype).at[..., 0].set(1.0)
+    palms, fingers = chains
+    nothing = jnp.zeros((HANDS, 3), physics.qpos.dtype)
+    world = nothing, jnp.zeros((HANDS, 4), nothing.dtype).at[:, 0].set(1.0), nothing, nothing
+    palm = (jnp.repeat(x[:, None], len(FINGERS), axis=1) for x in _descend(palms, physics, world))
+    return jnp.concatenate(_descend(fingers, physics, tuple(palm)), axis=-1)
 
-    def descend(frame: tuple[jax.Array, ...], link: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, ...], None]:
+
+def _descend(links: _Links, physics: PhysicsState, base: _Frame) -> _Frame:
+    """The last links' frames, from that of what the first are fixed to."""
+    offset, rest, axis = (jnp.asarray(x, physics.qpos.dtype) for x in (links.offset, links.turn, links.axis))
+    hinged = np.any(links.axis != 0, axis=-1)
+    half = jnp.where(hinged, 0.5 * physics.qpos[links.dof], 0.0)[..., None]
+    half_turned = _multiply(rest, jnp.concatenate([jnp.zeros_like(axis[..., :1]), axis], axis=-1))
+    bent = jnp.cos(half) * rest + jnp.sin(half) * half_turned
+    bending = physics.qvel[links.dof][..., None] * _rotate(rest, axis)
+
+    def down(frame: _Frame, link: tuple[jax.Array, ...]) -> tuple[_Frame, None]:
         place, turn, velocity, spin = frame
-        offset, rest, axis, angle, speed = link
+        offset, bent, bending = link
         arm = _rotate(turn, offset)
-        turn = _multiply(turn, rest)
-        bent = jnp.concatenate([jnp.cos(0.5 * angle), jnp.sin(0.5 * angle) * axis], axis=-1)
-        bent_turn, bent_spin = _multiply(turn, bent), spin + _rotate(turn, axis) * speed
-        return (place + arm, bent_turn, velocity + jnp.cross(spin, arm), bent_spin), None
+        velocity = velocity + jnp.cross(spin, arm)
+        return (place + arm, _multiply(turn, bent), velocity, spin + _rotate(turn, bending)), None
 
-    constants = (jnp.asarray(x, qpos.dtype) for x in (chains.offset, chains.turn, chains.axis))
-    hinged = np.any(chains.axis != 0, axis=-1)[..., None]
-    moving = (jnp.where(hinged, x[chains.dof][..., None], 0.0) for x in (qpos, qvel))
-    start = (nothing, unturned, nothing, nothing)
-    return jnp.concatenate(jax.lax.scan(descend, start, (*constants, *moving))[0], axis=-1)
+    return jax.lax.scan(down, base, (offset, bent, bending))[0]

@@ -114,7 +114,9 @@ class Engine(Protocol):
 
         Returns:
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
-          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`.
+          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. Beside them stands
+          `overflow`, 1 where the step found no room for all contacts or constraints and is wrong, else 0: only warp
+          has buffers that can be too small without raising.
         """
         ...
 
@@ -128,6 +130,7 @@ def make_engine(
     solver: str = "converged",
     fast_contacts: Collection[str] = (),
     threads: int | None = None,
+    contacts: int | None = None,
 ) -> Engine:
     """Builds an engine for a model.
 
@@ -141,6 +144,7 @@ def make_engine(
         grow to 1e-3.
       fast_contacts: names of the geoms that keep their contacts when the solver is fast; empty keeps all.
       threads: of the `mujoco` engine; the process's usable CPUs where None.
+      contacts: of the `warp` engine: room for so many contacts in a world; derived from the model where None.
 
     Raises:
       TaskError: unknown engine or solver, or an engine that cannot run here.
@@ -154,7 +158,9 @@ def make_engine(
         _cut_solver(model, fast_contacts)
     if physics == "mujoco":
         return CEngine(model, substeps, readout, threads)
-    return {"mjx": MjxEngine, "warp": WarpEngine}[physics](model, substeps, readout)
+    if physics == "warp":
+        return WarpEngine(model, substeps, readout, contacts)
+    return MjxEngine(model, substeps, readout)
 
 
 def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
@@ -249,7 +255,8 @@ class CEngine:
         packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(state.qpos.dtype)])
         flat = host_call(self._target, packed, self._width)
         qpos, qvel, warmstart, *rest = (flat[place].reshape(shape) for place, shape in self._parts)
-        return PhysicsState(qpos, qvel, warmstart), dict(zip(self._readout, rest, strict=True))
+        out = dict(zip(self._readout, rest, strict=True))
+        return PhysicsState(qpos, qvel, warmstart), out | {"overflow": jnp.zeros((), qpos.dtype)}
 
     def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
         """The host's side: qpos, qvel, warm start and ctrl [..., D] to what `_Worker` writes [..., E]."""
@@ -300,7 +307,12 @@ class _Worker:
     """One thread's mjData, with the array views that are read and written every control step."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
-        self._model, self._substeps = model, substeps
+        self._model = model
+        self._steps = [(model, substeps)]
+        if model.nsensor and substeps > 1:  # nobody reads the sensors before the last
+            unsensed = copy.copy(model)
+            unsensed.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+            self._steps = [(unsensed, substeps - 1), (model, 1)]
         self._data = data = mujoco.MjData(model)
         self._post_constraint = _needs_post_constraint(readout)
         self._warnings = data.warning
@@ -321,7 +333,8 @@ class _Worker:
         data = self._data
         data.time = 0.0
         mujoco.mj_setState(self._model, data, state, _PACKED)
-        mujoco.mj_step(self._model, data, self._substeps)
+        for model, substeps in self._steps:
+            mujoco.mj_step(model, data, substeps)
         if self._post_constraint:
             mujoco.mj_rnePostConstraint(self._model, data)
         np.concatenate(self._outputs, out=out, casting="same_kind")
@@ -474,27 +487,36 @@ class MjxEngine:
             data = jax.lax.fori_loop(0, self._substeps, lambda _, d: mjx.step(self._model, d), data)
             if _needs_post_constraint(self._readout):
                 data = smooth.rne_postconstraint(self._model, data)
-        return _unloaded(data, self._readout)
+        after, out = _unloaded(data, self._readout)
+        return after, out | {"overflow": jnp.zeros((), after.qpos.dtype)}
 
 
 class WarpEngine:
-    """MJX with the MuJoCo-Warp implementation. Its sums are atomic: runs do not repeat to the last bit."""
+    """MJX with the MuJoCo-Warp implementation. Its sums are atomic: runs do not repeat to the last bit.
+
+    Buffers are sized by the model (`_room`) and the batch, and every step says whether they were large enough.
+    """
 
     name = "warp"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None):
         mjx = import_mjx()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
-        self._contacts, self._rows = _room(model)
+        self._contacts, self._rows = _room(model, contacts)
+        settings: dict[str, Any] = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
+        if _needs_post_constraint(readout):
+            settings["opt._impl.run_rne_postconstraint"] = True
         with jax.ensure_compile_time_eval():
-            self._model = mjx.put_model(model, impl="warp")
-            if _needs_post_constraint(readout):
-                self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": True})
+            self._model = mjx.put_model(model, impl="warp").tree_replace(settings)
 
     def start(self) -> PhysicsState:
         return _start(self._c_model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        # Controls that a scan takes straight from its inputs reached Warp as an illegal address (jax 0.11.2, H200;
+        # computed ones did not): XLA hands such slices to a foreign call without a copy. Beyond mjMAXVAL nothing is
+        # simulated anyway.
+        ctrl = jnp.clip(ctrl, -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
         lone = jax.tree.map(lambda x: x[None], (state, ctrl))
         return jax.tree.map(lambda x: x[0], _flattened(self._step_all)(*lone))
 
@@ -507,7 +529,9 @@ class WarpEngine:
             own = _loaded(data, state, ctrl)
             for _ in range(self._substeps):
                 own = mjx.step(self._model, own)
-            return _unloaded(own, self._readout)
+            after, out = _unloaded(own, self._readout)
+            lost = (own._impl.overflow & _LOST) != 0
+            return after, out | {"overflow": lost.astype(after.qpos.dtype)}
 
         return jax.vmap(one)(state, ctrl)
 
@@ -546,10 +570,11 @@ def _flattened(batched: Any) -> Any:
 
 
 _MOST_CONTACTS = 64  # of one world; 30 were enough for the ant, 60 for two hands
+_LOST = 0b11111  # MuJoCo-Warp's overflow bits that cost contacts or constraints; the others are of solvers and sensors
 
 
-def _room(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and constraint rows that one world of the model needs at most."""
+def _room(model: mujoco.MjModel, contacts: int | None = None) -> tuple[int, int]:
+    """Contacts and constraint rows that one world of the model needs at most, for so many contacts if given."""
     first, second = np.triu_indices(model.ngeom, 1)
     wanted = (model.geom_contype[first] & model.geom_conaffinity[second]) | (
         model.geom_contype[second] & model.geom_conaffinity[first]
@@ -558,7 +583,8 @@ def _room(model: mujoco.MjModel) -> tuple[int, int]:
     each = np.full(mujoco.mjtGeom.mjNGEOMTYPES, 4)  # contact points of a pair, by the type with the most
     each[mujoco.mjtGeom.mjGEOM_PLANE], each[mujoco.mjtGeom.mjGEOM_SPHERE], each[mujoco.mjtGeom.mjGEOM_CAPSULE] = 0, 1, 2
     points = np.maximum(each[model.geom_type[first]], each[model.geom_type[second]])
-    contacts = max(1, min(int(points[(wanted != 0) & apart].sum()), _MOST_CONTACTS))
+    most = int(points[(wanted != 0) & apart].sum()) + 4 * model.npair
+    contacts = contacts or max(1, min(most, _MOST_CONTACTS))
     limits = int(model.jnt_limited.sum() + model.tendon_limited.sum())
     dry = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
     return contacts, 2 * (int(model.geom_condim.max()) - 1) * contacts + limits + dry + 6 * model.neq

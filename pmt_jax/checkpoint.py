@@ -20,15 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from . import devices, processes
 from .errors import UsageError
 
 KEEP = 2
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
-    """A pytree as {path: array}; typed keys become their numbers, empty leaves are left out."""
+    """A pytree as {path: array}; typed keys become their numbers, empty leaves are left out.
+
+    Where the arrays lie in several processes, all of them must call it.
+    """
     leaves = {jax.tree_util.keystr(path): x for path, x in jax.tree_util.tree_leaves_with_path(tree)}
-    plain = {path: jax.random.key_data(x) if _is_key(x) else x for path, x in leaves.items()}
+    plain = devices.whole({path: jax.random.key_data(x) if _is_key(x) else x for path, x in leaves.items()})
     return {path: np.asarray(x) for path, x in plain.items() if x.size}
 
 
@@ -79,18 +83,29 @@ def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class Checkpoints:
-    """The checkpoints of a run folder, named by their step, the last `KEEP` of them kept."""
+    """The checkpoints of a run folder, named by their step, the last `KEEP` of them kept.
+
+    Of several processes, all must call the methods, and the first does what there is to do.
+    """
 
     def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
         """Opens the checkpoints of `folder`; `read_only` changes nothing on disk, so that looking is always allowed."""
         self._folder = (folder / "checkpoints").absolute()
+        self._manager: Any = None
+        processes.by_first(lambda: self._open(read_only))
+
+    def _open(self, read_only: bool) -> None:
+        several = jax.process_count() > 1
+        if several and not read_only:
+            self._folder.mkdir(parents=True, exist_ok=True)  # orbax does not where it is to be used by one alone
         with _quiet():
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=KEEP,
-                create=not read_only,
+                create=not read_only and not several,
                 cleanup_tmp_directories=not read_only,  # what a kill in the middle of a save left behind
                 read_only=read_only,
                 enable_async_checkpointing=False,
+                multiprocessing_options=ocp.options.MultiprocessingOptions(active_processes={0} if several else None),
             )
             self._manager = ocp.CheckpointManager(self._folder, options=options)
 
@@ -100,9 +115,13 @@ class Checkpoints:
         Raises:
           OSError: it could not be written (a full disk, a quota, a share that went away).
         """
-        if step in self._manager.all_steps():
+        if step in self.steps():
             return
-        data = _to_bytes(pack(tree))
+        table = pack(tree)
+        processes.by_first(lambda: self._write(step, table))
+
+    def _write(self, step: int, table: dict[str, np.ndarray]) -> None:
+        data = _to_bytes(table)
         try:
             with _quiet():
                 self._manager.save(step, args=ocp.args.StandardSave({"npz": data}))
@@ -111,7 +130,7 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """The steps of the complete checkpoints, newest first."""
-        return sorted(self._manager.all_steps(), reverse=True)
+        return processes.by_first(lambda: sorted(self._manager.all_steps(), reverse=True))
 
     def load(self, like: Any, warn: Callable[[str], object]) -> tuple[int, Any]:
         """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
@@ -122,7 +141,12 @@ class Checkpoints:
         Raises:
           UsageError: there is none, or it belongs to another kind of run.
         """
-        for step in self.steps():
+        step, packed = processes.by_first(lambda: self._newest(warn))
+        return step, unpack(packed, like)
+
+    def _newest(self, warn: Callable[[str], object]) -> tuple[int, dict[str, np.ndarray]]:
+        steps = sorted(self._manager.all_steps(), reverse=True)
+        for step in steps:
             try:
                 with _quiet():
                     restored: Any = self._manager.restore(step, args=ocp.args.StandardRestore())
@@ -132,19 +156,19 @@ class Checkpoints:
             except (ValueError, KeyError, OSError) as error:
                 warn(f"the checkpoint after {step:,} steps in {self._folder} cannot be read ({_reason(error)})")
                 continue
-            return step, unpack(packed, like)
-        if self.steps():
+            return step, packed
+        if steps:
             raise UsageError(f"no checkpoint in {self._folder} can be read; restore one from a backup or train anew")
         raise UsageError(f"there is no finished checkpoint in {self._folder}; train the run first")
 
     def forget_after(self, step: int) -> None:
         """Deletes the checkpoints of later steps, from which nobody could continue."""
-        for later in [s for s in self.steps() if s > step]:
-            self._manager.delete(later)
+        processes.by_first(lambda: [self._manager.delete(s) for s in self._manager.all_steps() if s > step])
 
     def close(self) -> None:
         """Lets go of the folder."""
-        self._manager.close()
+        if self._manager is not None:
+            self._manager.close()
 
 
 def _reason(error: Exception) -> str:

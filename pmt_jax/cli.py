@@ -7,7 +7,7 @@ import os
 import pathlib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import pmt_jax
@@ -18,6 +18,7 @@ from .errors import UsageError
 from .methods import METHODS
 
 _METAVARS = {int: "N", float: "X"}
+_RUN = "a run folder, or a pretrained policy: hub:ant_2x4/r4sg (pmt hub lists them)"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -44,24 +45,37 @@ def _actions(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> lis
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code (2 for a user's mistake)."""
-    argv = sys.argv[1:] if argv is None else list(argv)
+    return answer("pmt", lambda: _run(sys.argv[1:] if argv is None else list(argv)))
+
+
+def answer(name: str, command: Callable[[], int]) -> int:
+    """The exit code of `command`; a user's mistake gets one sentence that begins with the program's `name`, and 2."""
     try:
-        parser, commands = _parser()
-        if argv and not argv[0].startswith("-") and argv[0] not in commands:
-            raise UsageError(f"unknown command '{argv[0]}'{tasks.did_you_mean(argv[0], commands)}")
-        arguments = parser.parse_all(argv)
-        if arguments.command is None:
-            parser.print_help()
-            return 0
-        return arguments.run(arguments)
+        return command()
     except UsageError as error:
-        print(f"pmt: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # whoever read our output, head for example, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+
+
+def refuse_unknown(argv: Sequence[str], commands: Sequence[str]) -> None:
+    """Names the nearest command where the first word is none; argparse would list them all."""
+    if argv and not argv[0].startswith("-") and argv[0] not in commands:
+        raise UsageError(f"unknown command '{argv[0]}'{tasks.did_you_mean(argv[0], commands)}")
+
+
+def _run(argv: Sequence[str]) -> int:
+    parser, commands = _parser()
+    refuse_unknown(argv, commands)
+    arguments = parser.parse_all(argv)
+    if arguments.command is None:
+        parser.print_help()
+        return 0
+    return arguments.run(arguments)
 
 
 def _parser() -> tuple[_Parser, list[str]]:
@@ -81,6 +95,8 @@ def _parser() -> tuple[_Parser, list[str]]:
     _add_report(commands)
     envs = commands.add_parser("envs", help="list the tasks", allow_abbrev=False)
     envs.set_defaults(run=_envs)
+    hub = commands.add_parser("hub", help="list the pretrained policies, and how good they are", allow_abbrev=False)
+    hub.set_defaults(run=_hub)
     return parser, list(commands.choices)
 
 
@@ -103,8 +119,21 @@ def _add_train(commands: Any) -> None:
         "--sink", default="", metavar="NAMES", help="figures also go to csv, tensorboard, wandb (any, with commas)"
     )
     train.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="write a JAX profiler trace of a few chunks")
+    _add_devices(train)
+    hosts = train.add_argument_group("several processes", "for a run on many hosts; under SLURM's srun none is needed")
+    hosts.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process listens")
+    hosts.add_argument("--process", metavar="I", help="which process this is, from 0")
+    hosts.add_argument("--processes", metavar="N", help="how many there are")
     _add_settings(train)
     train.set_defaults(run=_train)
+
+
+def _add_devices(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--devices",
+        metavar="N",
+        help="split seeds and environments over N devices (default 1; in several processes all)",
+    )
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -136,7 +165,11 @@ def _add_eval(commands: Any) -> None:
         description="Reward, cost, violation rate and the task's own figures over whole episodes with fixed keys.",
         allow_abbrev=False,
     )
-    evaluation.add_argument("source", metavar="RUN|TASK", help="a run folder, or with --policy a task's name")
+    evaluation.add_argument(
+        "source",
+        metavar="RUN|TASK",
+        help="a run folder, a pretrained policy (pmt hub lists them), or with --policy a task's name",
+    )
     evaluation.add_argument("--policy", help="a policy that is not learned: zero, random, droop or opf (voltage tasks)")
     evaluation.add_argument("--env", action="append", default=[], metavar="NAME=VALUE", help="the task's own options")
     evaluation.add_argument("--episodes", default="32", help="episodes per seed (default 32)")
@@ -164,6 +197,7 @@ def _add_sweep(commands: Any) -> None:
     )
     sweep.add_argument("--out", type=pathlib.Path, required=True, help="the folder that gets a run folder per point")
     sweep.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_devices(sweep)
     _add_settings(sweep)
     sweep.set_defaults(run=_sweep)
 
@@ -198,6 +232,7 @@ def _add_reproduce(commands: Any) -> None:
     )
     reproduce.add_argument("--out", type=pathlib.Path, help="the folder of its runs (default: runs/reproduce-BUDGET)")
     reproduce.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_devices(reproduce)
     _add_format(reproduce)
     reproduce.set_defaults(run=_reproduce)
 
@@ -213,7 +248,7 @@ def _add_export(commands: Any) -> None:
         description="Writes policy.stablehlo (jax.export), policy.npz (weights) and numpy_policy.py (their loader).",
         allow_abbrev=False,
     )
-    export.add_argument("source", metavar="RUN", type=pathlib.Path, help="a run folder")
+    export.add_argument("source", metavar="RUN", type=pathlib.Path, help=_RUN)
     export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
     export.add_argument("--seed", metavar="N", help="which of the run's seeds (default: its first)")
     _add_which(export)
@@ -231,7 +266,7 @@ def _add_render(commands: Any) -> None:
         description="Plays one episode and writes it as a film, or as a page that replays it in any browser.",
         allow_abbrev=False,
     )
-    render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help="a run folder")
+    render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help=_RUN)
     render.add_argument("-o", "--out", type=pathlib.Path, default=pathlib.Path("replay.html"), metavar="FILE")
     render.add_argument("--seed", metavar="K", help="whose policy, of the run's seeds (default: its first)")
     render.add_argument("--episode", default="0", metavar="N", help="which of the fixed starts (default 0)")
@@ -274,9 +309,12 @@ def _train(arguments: argparse.Namespace) -> int:
     config = settings.load_config(arguments.source, preset=arguments.preset, **_given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
+    count, process = _optional("--devices", arguments.devices, 1), _optional("--process", arguments.process, 0)
+    hosts = _optional("--processes", arguments.processes, 1)
     _quiet_xla()
-    from . import experiment
+    from . import experiment, processes
 
+    processes.join(arguments.coordinator, process, hosts)
     return experiment.train(
         config,
         arguments.out,
@@ -285,6 +323,7 @@ def _train(arguments: argparse.Namespace) -> int:
         sinks=[name for name in arguments.sink.split(",") if name],
         profile=arguments.profile,
         say=_say,
+        count=count,
     )
 
 
@@ -310,7 +349,8 @@ def _eval(arguments: argparse.Namespace) -> int:
     else:
         source, physics = pathlib.Path(arguments.source), arguments.physics
         rows = experiment.evaluate_run(source, episodes, arguments.deterministic, arguments.which, physics, say=_say)
-        how = f"{'mean' if arguments.deterministic else 'sampled'} actions of the {arguments.which} policy"
+        how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
+        how += " of the best policy" if arguments.which == "best" else ""
     print(f"{arguments.source}: {episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
     for row in rows:
         whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
@@ -323,11 +363,22 @@ def _eval(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     vary = dict(_values(word) for word in arguments.vary)
-    _quiet_xla()
+    count = _optional("--devices", arguments.devices, 1)
+    _alone("pmt sweep")
     from . import sweep
 
     points = sweep.grid(arguments.source, vary, arguments.preset, **_given(arguments))
-    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say)
+    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say, count=count)
+
+
+def _alone(command: str) -> None:
+    """Refuses to run once in each of several processes, which would write into the same folders."""
+    _quiet_xla()
+    from . import processes
+
+    processes.make_room()
+    if processes.in_step():
+        raise UsageError(f"{command} runs in one process; start it without srun, or with srun --ntasks=1")
 
 
 def _values(word: str) -> tuple[str, list[str]]:
@@ -356,12 +407,13 @@ def _table(arguments: argparse.Namespace) -> int:
 
 
 def _reproduce(arguments: argparse.Namespace) -> int:
-    _quiet_xla()
+    count = _optional("--devices", arguments.devices, 1)
+    _alone("pmt reproduce")
     from . import sweep
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
     cache = not arguments.no_cache
-    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache=cache, say=_say)
+    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache, _say, count)
 
 
 def _whole(flag: str, text: str, least: int) -> int:
@@ -370,8 +422,12 @@ def _whole(flag: str, text: str, least: int) -> int:
     return int(text)
 
 
+def _optional(flag: str, text: str | None, least: int) -> int | None:
+    return None if text is None else _whole(flag, text, least)
+
+
 def _export(arguments: argparse.Namespace) -> int:
-    seed = None if arguments.seed is None else _whole("--seed", arguments.seed, least=0)
+    seed = _optional("--seed", arguments.seed, 0)
     _quiet_xla()
     from .policy import export_policy
 
@@ -389,7 +445,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    seed = None if arguments.seed is None else _whole("--seed", arguments.seed, 0)
+    seed = _optional("--seed", arguments.seed, 0)
     number = _whole("--episode", arguments.episode, 0)
     steps = [None if part == "" else _whole("--steps", part, 0) for part in arguments.steps.split(":")]
     if len(steps) not in (2, 3) or steps[2:] == [0]:
@@ -437,6 +493,19 @@ def _report(arguments: argparse.Namespace) -> int:
 def _envs(arguments: argparse.Namespace) -> int:
     del arguments
     print("\n".join(tasks.names()))
+    return 0
+
+
+def _hub(arguments: argparse.Namespace) -> int:
+    del arguments
+    from . import pretrained
+
+    print("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/pretrained.md)")
+    for name in pretrained.names():
+        facts = pretrained.about(name)
+        (reward, rewards), (cost, costs) = (facts["figures"][f"episode_{what}"] for what in ("reward", "cost"))
+        limit = f"limit {facts['cost_limit']:g}"
+        print(f"{name:28} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
     return 0
 
 

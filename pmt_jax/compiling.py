@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import learner
+from . import devices, learner
 from .evaluation import evaluate
 from .run import Run
-from .types import LearnerState, Metrics
+from .types import ActingState, LearnerState, Metrics
 
 
 class Programs(NamedTuple):
@@ -69,25 +69,36 @@ def compile_run(run: Run, say: Callable[[str], None]) -> tuple[LearnerState, Pro
     say("compiling ...")
     begin = time.monotonic()
     hyper, keys, axes = run.side_by_side
-    state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
+    init = _over_seeds(run, functools.partial(learner.init, run), axes)
+    placement = devices.placement(run.mesh, jax.eval_shape(init, hyper, keys))
+    everywhere = devices.everywhere(run.mesh)
+    state = jax.jit(init, out_shardings=placement)(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
         return learner.train_chunk(run, hyper, state, config.log_interval)
 
-    lowered = jax.jit(jax.vmap(chunk, axes), donate_argnums=1).lower(hyper, state)
+    program = jax.jit(_over_seeds(run, chunk, axes), donate_argnums=1, out_shardings=(placement, everywhere))
+    with devices.on(run.mesh):
+        lowered = program.lower(hyper, state)
     with cache_events() as events:
         compiled = lowered.compile()
     evaluation = None
     if config.eval_interval:
-        evaluation = jax.jit(evaluate_seeds(run, config.eval_episodes, deterministic=True)).lower(state).compile()
+        program = jax.jit(evaluate_seeds(run, config.eval_episodes, deterministic=True), out_shardings=everywhere)
+        with devices.on(run.mesh):
+            evaluation = program.lower(state).compile()
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found})")
     return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1))
 
 
-def evaluate_seeds(run: Run, episodes: int, deterministic: bool) -> Callable[[LearnerState], Metrics]:
+def evaluate_seeds(run: Run, episodes: int, deterministic: bool) -> Callable[[ActingState], Metrics]:
     """`evaluate` of all seeds: state with a leading [seeds] -> figures [seeds, episodes]."""
-    return jax.vmap(functools.partial(evaluate, run, episodes=episodes, deterministic=deterministic))
+    return _over_seeds(run, functools.partial(evaluate, run, episodes=episodes, deterministic=deterministic), 0)
+
+
+def _over_seeds(run: Run, function: Callable[..., Any], axes: Any) -> Callable[..., Any]:
+    return jax.vmap(function, axes, spmd_axis_name=devices.SEED if run.mesh else None)
 
 
 def _take(improved: jax.Array, best: LearnerState, state: LearnerState) -> LearnerState:

@@ -93,7 +93,7 @@ class Config(Hyper):
       method: who learns; a row of the table in pmt_jax/methods.py.
       steps: environment steps to train for, per seed, over all its environments; rounded up to whole chunks.
       seeds: how many seeds train side by side in one program.
-      seed: the first seed; the others count up from it.
+      seed: the first seed; the others count up from it. It names a run to the last bit, but on physics warp.
       num_envs: environments per seed, B.
       rollout_length: control steps each environment takes between updates, T.
       epochs: passes over the batch per update, for every network.

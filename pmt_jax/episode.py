@@ -15,7 +15,7 @@ from . import experiment, tasks
 from .errors import UsageError
 from .evaluation import EVALUATION_KEY
 from .run import Run
-from .types import LearnerState
+from .types import ActingState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +70,7 @@ def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, d
     """Plays one episode with the policy of a run folder.
 
     Args:
+      folder: the run folder, or the name of a pretrained policy.
       seed: of the run's seeds; its first where None.
       number: which of the fixed starts.
       deterministic: take the mean action instead of a sample.
@@ -89,11 +90,11 @@ def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, d
     return _whole(run, seed, moments)
 
 
-def record(run: Run, state: LearnerState, number: jax.Array, *, deterministic: bool) -> dict[str, Any]:
+def record(run: Run, state: ActingState, number: jax.Array, *, deterministic: bool) -> dict[str, Any]:
     """The moments of one episode up to its time limit, whether or not it ended before; pure.
 
     Args:
-      state: a learner state of one seed.
+      state: a learner state of one seed, or what of it acts.
       number: [] which of the fixed starts.
 
     Returns:

@@ -12,21 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from . import tasks
+from . import devices, tasks
 from .run import Run
-from .types import LearnerState, Metrics
+from .types import ActingState, Metrics
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
 
 
-def evaluate(run: Run, state: LearnerState, episodes: int, *, deterministic: bool) -> Metrics:
+def evaluate(run: Run, state: ActingState, episodes: int, *, deterministic: bool) -> Metrics:
     """Runs one seed's policy for `episodes` whole episodes.
 
     Args:
       run: the run's task and networks.
-      state: a learner state of one seed.
+      state: a learner state of one seed, or what of it acts.
       episodes: environments, one episode each.
       deterministic: take the mean action instead of a sample.
 
@@ -53,12 +53,13 @@ def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
     """
     vector = tasks.VectorEnv(env, episodes)
     mask = jnp.asarray(vector.spec.action_mask)
+    step_apart = devices.apart(vector.step)
 
     def step(
         carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array
     ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
         state, alive, sums = carry
-        state, outcome = vector.step(state, act(state.env, t) * mask)
+        state, outcome = step_apart(state, act(state.env, t) * mask)
         cost = outcome.cost.sum(-1)
         now = {
             "episode_reward": outcome.reward,

@@ -16,15 +16,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from . import folder, tasks
+from . import devices, folder, processes, tasks
 from .checkpoint import Checkpoints
 from .compiling import Programs, compile_run, evaluate_seeds, use_cache
 from .config import Config
+from .errors import UsageError
 from .evaluation import improves, interval, play
 from .folder import Say, load_run
 from .run import Lanes, Run, setup
 from .sinks import Profile, Sink, check_sinks, duration, open_sinks
-from .types import Best, LearnerState, Metrics
+from .types import ActingState, Best, LearnerState, Metrics
 
 CHECKPOINT_SECONDS = 300.0
 LOSSES = ("actor/loss", "critic/loss", "cost_critic/loss")
@@ -40,6 +41,7 @@ def train(
     profile: pathlib.Path | None = None,
     say: Say = print,
     lanes: Lanes | None = None,
+    count: int | None = None,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -51,6 +53,8 @@ def train(
       profile: a folder for a JAX profiler trace of a few chunks.
       lanes: settings and seeds of `config.seeds` lanes, in place of the config's; one whose loss stops being finite
         does not stop the others.
+      count: of devices to split the run over, of all processes together: one where None, or all of several processes'.
+        Of these, the first writes and speaks, and all return the same.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a loss stopped
@@ -61,32 +65,68 @@ def train(
     """
     jax.config.update("jax_default_matmul_precision", folder.MATMUL_PRECISION)
     check_sinks(sinks)
-    run = dataclasses.replace(setup(config), lanes=lanes)
+    run = dataclasses.replace(setup(config), lanes=lanes, mesh=devices.make_mesh(config, count))
+    if not processes.is_first():
+        say, sinks, profile = _silence, (), None
     out = out or pathlib.Path("runs") / f"{run.vector.spec.name}-{config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder.open_folder(out, run, resume, say)
+    processes.by_first(lambda: folder.open_folder(out, run, resume, say))
     _announce(run, out, say)
     if cache:
         use_cache()
     state, programs = compile_run(run, say)
     start = _Position(state, folder.first_best(state))
-    command = "the same command" if lanes else f"pmt train {out / 'config.toml'} --out {out} --resume"
+    command = _command(run, out)
     try:
-        with contextlib.ExitStack() as stack:
-            checkpoints = stack.enter_context(contextlib.closing(Checkpoints(out)))
-            if resume:
-                start = _restore(start, checkpoints, out, say)
-            folder.write_settings(out, run)
-            opened = open_sinks(sinks, out, config, start.step)
-            for sink in opened:
-                stack.enter_context(contextlib.closing(sink))
-            tracing = stack.enter_context(contextlib.closing(Profile(profile)))
-            end = _loop(run, programs, start, checkpoints, opened, tracing)
+        end = _train_into(out, run, programs, start, resume, sinks, profile, say)
     except BrokenPipeError:  # standard output's, not the folder's
         raise
     except OSError as error:
         say(_cannot_write(out, error, command))
         return 1
     return _farewell(end, run, out, command, say)
+
+
+def _train_into(
+    out: pathlib.Path,
+    run: Run,
+    programs: Programs,
+    start: _Position,
+    resume: bool,
+    sinks: Sequence[str],
+    profile: pathlib.Path | None,
+    say: Say,
+) -> _Position:
+    """Opens what is written to, trains, and closes it again."""
+    with contextlib.ExitStack() as stack:
+        checkpoints = stack.enter_context(contextlib.closing(Checkpoints(out)))
+        if resume:
+            start = _restore(run, start, checkpoints, out, say)
+        opened: list[Sink] = []
+        processes.by_first(lambda: _begin(run, out, start.step, sinks, opened))
+        for sink in opened:
+            stack.enter_context(contextlib.closing(sink))
+        tracing = stack.enter_context(contextlib.closing(Profile(profile)))
+        return _loop(run, programs, start, checkpoints, opened, tracing)
+
+
+def _command(run: Run, out: pathlib.Path) -> str:
+    """How to go on."""
+    if run.lanes:
+        return "the same command"
+    if jax.process_count() > 1:
+        return "the same command with --resume"
+    split = f" --devices {run.mesh.size}" if run.mesh else ""
+    return f"pmt train {out / 'config.toml'} --out {out} --resume{split}"
+
+
+def _silence(line: str) -> None:
+    del line
+
+
+def _begin(run: Run, out: pathlib.Path, step: int, sinks: Sequence[str], opened: list[Sink]) -> None:
+    """Writes the settings, and opens the sinks into `opened`."""
+    folder.write_settings(out, run)
+    opened += open_sinks(sinks, out, run.config, step)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,19 +160,26 @@ def _announce(run: Run, out: pathlib.Path, say: Say) -> None:
     threads = f", {len(os.sched_getaffinity(0))} CPUs" if hasattr(os, "sched_getaffinity") else ""
     say(f"pmt: {config.method} on {config.task}, {config.seeds} seed(s) from {config.seed}, into {out}")
     say(f"device {device.device_kind} ({device.platform}{threads}), physics engine {run.vector.env.engine}")
+    if run.mesh:
+        seeds, environments = run.mesh.devices.shape
+        say(
+            f"{run.mesh.size} devices in {jax.process_count()} process(es): seeds in {seeds} part(s), "
+            f"each seed's environments in {environments}"
+        )
     say(
         f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
         f"{config.num_updates:,} updates = {steps:,} steps a seed"
     )
 
 
-def _restore(start: _Position, checkpoints: Checkpoints, out: pathlib.Path, say: Say) -> _Position:
+def _restore(run: Run, start: _Position, checkpoints: Checkpoints, out: pathlib.Path, say: Say) -> _Position:
     """The newest checkpoint's position, all later traces of the run deleted; `start` where there is none yet."""
     step, saved = checkpoints.load(start.saved, say) if checkpoints.steps() else (0, start.saved)
     checkpoints.forget_after(step)
-    seconds = folder.forget_rows_after(out, step, say)
+    seconds = processes.by_first(lambda: folder.forget_rows_after(out, step, say))
     say(f"resuming after {step:,} steps")
-    return _Position(saved["last"], saved["best"], step, seconds)
+    best = dataclasses.replace(saved["best"], state=devices.place(run.mesh, saved["best"].state))
+    return _Position(devices.place(run.mesh, saved["last"]), best, step, seconds)
 
 
 def _loop(
@@ -141,26 +188,36 @@ def _loop(
     """Trains until done, interrupted or broken, and saves the end unless it is broken."""
     config, now = run.config, start
     begin = saved = time.monotonic()
+    stop = 0
     with _interruptible() as received:
-        while now.step < config.num_updates * config.batch_size and not received:
+        while now.step < config.num_updates * config.batch_size:
+            if stop := processes.agree(received[0] if received else 0):
+                break
             tracing.before_chunk()
             state, metrics = programs.chunk(now.state)
             step = now.step + config.log_interval * config.batch_size
             rows = _rows(run, step, jax.device_get(metrics))
-            broken = None if run.lanes else _broken(rows)
+            broken = _overflown(rows) or (None if run.lanes else _broken(rows))
             rows = _with_evaluation(run, programs, state, rows, skip=broken is not None)
             seconds = start.seconds + time.monotonic() - begin
-            for sink in sinks:
-                sink.write([{**row, "seconds": round(seconds, 3)} for row in rows])
+            _write(sinks, [{**row, "seconds": round(seconds, 3)} for row in rows])
             best = now.best if broken else _keep_best(run, programs, now.best, state, rows)
             now = _Position(state, best, step, seconds, broken)
             if broken:
                 return now
-            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+            if processes.agree(time.monotonic() - saved > CHECKPOINT_SECONDS):
                 checkpoints.save(step, now.saved)
                 saved = time.monotonic()
         checkpoints.save(now.step, now.saved)
-    return dataclasses.replace(now, signal=received[0] if received else None)
+    return dataclasses.replace(now, signal=stop or None)
+
+
+def _write(sinks: list[Sink], rows: list[dict[str, Any]]) -> None:
+    def write() -> None:
+        for sink in sinks:
+            sink.write(rows)
+
+    processes.by_first(write)
 
 
 def _cannot_write(out: pathlib.Path, error: OSError, command: str) -> str:
@@ -173,7 +230,7 @@ def _cannot_write(out: pathlib.Path, error: OSError, command: str) -> str:
 def _farewell(end: _Position, run: Run, out: pathlib.Path, command: str, say: Say) -> int:
     """Says how training ended and what to do next; returns the exit code."""
     if end.broken is not None:
-        say(f"stopped: {end.broken}; all figures are in {out}. Try a smaller learning rate with another --out.")
+        say(f"stopped: {end.broken}; all figures are in {out}, so choose another --out")
         return 1
     if end.step < run.config.num_updates * run.config.batch_size:
         say(f"interrupted after {end.step:,} steps; saved. Continue with: {command}")
@@ -205,6 +262,8 @@ def _rows(run: Run, step: int, metrics: dict[str, np.ndarray]) -> list[dict[str,
     return rows
 
 
+NO_ROOM = "the warp engine had no room for all contacts or constraints"
+OVERFLOW = "info/physics_overflow"  # of the ant and the hands, see `envs.physics.Engine`
 COUNTS = ("episodes", "terminations", "non_finite")
 
 
@@ -222,8 +281,20 @@ def _broken(rows: list[dict[str, Any]]) -> str | None:
     for row in rows:
         for name in LOSSES:
             if not math.isfinite(row[name]):
-                return f"{name} of seed {row['seed']} is {row[name]} at step {row['step']:,}"
+                found = f"{name} of seed {row['seed']} is {row[name]} at step {row['step']:,}"
+                return f"{found}; try a smaller learning rate"
     return None
+
+
+def _overflown(rows: list[dict[str, Any]]) -> str | None:
+    """What is wrong, if the physics lost contacts."""
+    share = max(row.get(OVERFLOW, 0.0) for row in rows)
+    if not share:
+        return None
+    return (
+        f"{NO_ROOM} in {share:.2g} of the steps up to step {rows[0]['step']:,}, which are wrong; take another "
+        "--physics, or give make_engine more `contacts`"
+    )
 
 
 def _with_evaluation(
@@ -303,21 +374,27 @@ def evaluate_run(
     """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
 
     Args:
-      out: the run folder, which is only read.
+      out: the run folder, which is only read, or the name of a pretrained policy.
       deterministic: take mean actions instead of samples.
       which: `last` or `best`.
       physics: an engine other than the run's.
     """
+    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic)
+
+
+def evaluate_states(run: Run, state: ActingState, episodes: int, deterministic: bool) -> list[dict[str, Any]]:
+    """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts."""
     jax.config.update("jax_default_matmul_precision", folder.MATMUL_PRECISION)
-    run, state = load_run(out, which, physics, say)
     results = jax.device_get(jax.jit(evaluate_seeds(run, episodes, deterministic))(state))
+    if np.any(results.get(OVERFLOW, 0) > 0):
+        raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
     return [
         {"seed": run.config.seed + i, "cost_limit": run.cost_limit, "step": step, **figures}
         for i, (figures, step) in enumerate(zip(_intervals(results), _steps(run, state), strict=True))
     ]
 
 
-def _steps(run: Run, state: LearnerState) -> list[int]:
+def _steps(run: Run, state: ActingState) -> list[int]:
     return [int(update) * run.config.batch_size for update in state.update]
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from . import devices
 from .types import Metrics, Params, Trained
 
 ADAM_EPS = 1e-5
@@ -62,11 +63,12 @@ def fit(
     Returns:
       The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
+    rows = devices.shared(rows)
     count = jax.tree.leaves(rows)[0].shape[0]
     shuffle = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(key, epochs))
 
     def step(net: Trained, index: jax.Array) -> tuple[Trained, Metrics]:
-        minibatch = jax.tree.map(lambda x: x[index], rows)
+        minibatch = devices.split(jax.tree.map(lambda x: x[index], rows))
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
         norm = optax.tree.norm(gradient)
         shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import learner
+from . import learner, pretrained
 from .checkpoint import Checkpoints
 from .config import Config, differences, load_config, to_toml
 from .errors import UsageError
 from .files import read_rows, replace_text
 from .run import Run, setup
 from .tasks import did_you_mean
-from .types import Best, LearnerState
+from .types import ActingState, Best, LearnerState
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
@@ -91,6 +91,7 @@ def versions(run: Run) -> dict[str, Any]:
     """What the numbers of a run depend on besides its settings."""
     found: dict[str, Any] = {name: version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    found |= {"devices": run.mesh.size if run.mesh else 1}
     return found | {"engine": run.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
 
 
@@ -135,19 +136,22 @@ def load_run(
     which: str = "last",
     physics: str | None = None,
     warn: Callable[[str], object] = warnings.warn,
-) -> tuple[Run, LearnerState]:
+) -> tuple[Run, ActingState]:
     """A run's settings and a learner state of it, with a leading [seeds].
 
     Args:
+      folder: the run folder, or the name of a pretrained policy, of which there is but what acts of one seed.
       which: `last`, or `best`: each seed's own best (see docs/runs.md).
       physics: an engine other than the run's.
       warn: told of damaged checkpoints, which are passed over.
 
     Raises:
-      UsageError: the folder holds no run, or no checkpoint.
+      UsageError: the folder holds no run, or no checkpoint; or there is no such policy.
     """
     if which not in WHICH:
         raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
+    if pretrained.is_name(folder):
+        return pretrained.load(str(folder), physics)
     run, _, saved = load_saved(folder, physics, warn)
     return run, saved["last"] if which == "last" else saved["best"].state
 

@@ -126,6 +126,10 @@ class Networks:
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])), params)
         return jax.vmap(self.policy, in_axes=(0, -2), out_axes=(-2, 0))(params, obs)
 
+    def of_deviation(self, params: Params) -> Params:
+        """True at the weights of an actor's deviation: on these its Fisher matrix is diagonal."""
+        return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, path[-1].key == "std"), params)
+
     def layers(self, params: Params) -> dict[str, jax.Array]:
         """The mean's weights under plain names, for every layer i and with a leading [N].
 

@@ -15,7 +15,7 @@ from . import normalise, numpy_policy
 from .errors import UsageError
 from .folder import MATMUL_PRECISION, load_run
 from .run import Run
-from .types import LearnerState, Moments, Params
+from .types import ActingState, Moments, Params
 
 Policy = Callable[[jax.Array], jax.Array]
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -25,7 +25,7 @@ def load_policy(folder: str | pathlib.Path, seed: int | None = None, which: str 
     """A run's team policy as a pure function, to be jitted and vmapped at will.
 
     Args:
-      folder: the run folder, which is only read.
+      folder: the run folder, which is only read, or the name of a pretrained policy: `hub:ant_2x4/r4sg`.
       seed: one of the run's seeds; its first if None.
       which: `last`, or `best`: the seed's own best (see docs/runs.md).
 
@@ -74,7 +74,7 @@ def weights(run: Run, params: Params, moments: Moments) -> dict[str, np.ndarray]
     return {name: np.asarray(x) for name, x in named.items()}
 
 
-def _seed_of(folder: str | pathlib.Path, seed: int | None, which: str) -> tuple[Run, LearnerState]:
+def _seed_of(folder: str | pathlib.Path, seed: int | None, which: str) -> tuple[Run, ActingState]:
     run, states = load_run(pathlib.Path(folder), which, physics="auto")  # nothing will be simulated
     first, count = run.config.seed, run.config.seeds
     index = 0 if seed is None else seed - first
@@ -83,7 +83,7 @@ def _seed_of(folder: str | pathlib.Path, seed: int | None, which: str) -> tuple[
     return run, jax.tree.map(lambda x: x[index], states)
 
 
-def _policy(run: Run, state: LearnerState) -> Policy:
+def _policy(run: Run, state: ActingState) -> Policy:
     mask = jnp.asarray(run.vector.spec.action_mask)
 
     def policy(obs: jax.Array) -> jax.Array:

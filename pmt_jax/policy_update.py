@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from . import distributions, dual, trust_region
+from . import devices, distributions, dual, trust_region
 from .coping import clipped_surrogate, hybrid_advantage
 from .fit import fit
 from .returns import standardise
@@ -118,6 +118,7 @@ def _of(tree: Any, i: jax.Array) -> Any:
 
 def _moved(run: Run, params: Params, rows: PolicyRows) -> tuple[jax.Array, jax.Array]:
     """How far a policy is from the one that acted: log-ratios [R], and the mean KL(old || new) in nats."""
+    rows = devices.split(rows)
     mean, std = run.nets.policy(params, rows.obs)
     kl = distributions.kl(rows.mean, rows.std, mean, std, rows.mask).mean()
     return distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob, kl
@@ -187,6 +188,7 @@ def _trust_region_step(
     run: Run, hyper: Hyper, start: jax.Array, unravel: Any, rows: PolicyRows, violation: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """One constrained step from the flat weights `start` [P]: direction, line search (specification, section 2.9)."""
+    rows = devices.split(rows)
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
         return run.nets.policy(unravel(flat), rows.obs)
@@ -208,7 +210,10 @@ def _trust_region_step(
     _, fisher = jax.linearize(jax.grad(divergence), start)
     # What the steps before this one are expected to have changed counts towards the limit.
     c = violation + cost0 - jnp.mean(rows.factor * rows.cost_advantage)
-    direction = trust_region.constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, hyper.kl_limit)
+    uncoupled, _ = ravel_pytree(run.nets.of_deviation(unravel(start)))
+    direction = trust_region.constrained_direction(
+        g, b, c, lambda v: fisher(v) + hyper.damping * v, hyper.kl_limit, uncoupled
+    )
 
     def accept(flat: jax.Array) -> jax.Array:
         loss, cost = objectives(flat)

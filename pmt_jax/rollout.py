@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from . import distributions
+from . import devices, distributions
 from .tasks import Outcome, State, VectorEnv
 from .types import Batch, RolloutState
 
@@ -46,13 +46,14 @@ def collect(
     """
     mask = jnp.asarray(vector.spec.action_mask)
     normalise_obs, normalise_state = normalise
+    step_apart = devices.apart(vector.step)
 
     def step(state: RolloutState, t: jax.Array) -> tuple[RolloutState, tuple[Batch, tuple[jax.Array, jax.Array]]]:
         env: State = state.vector.env
         obs = normalise_obs(env.obs)
         mean, std = policy(obs)
         action = mean + std * jax.random.normal(jax.random.fold_in(key, t), mean.shape)
-        next_vector, outcome = vector.step(state.vector, action * mask)
+        next_vector, outcome = step_apart(state.vector, action * mask)
         sums = RolloutState(
             next_vector,
             state.reward_sum + outcome.reward,

@@ -32,6 +32,7 @@ class Run:
     """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
 
     With `lanes`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
+    With `mesh`, it is split over several devices (see devices.py).
     """
 
     config: Config
@@ -39,6 +40,7 @@ class Run:
     vector: tasks.VectorEnv
     nets: networks.Networks
     lanes: Lanes | None = None
+    mesh: jax.sharding.Mesh | None = None
 
     @property
     def cost_limit(self) -> float:

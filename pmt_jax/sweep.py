@@ -64,9 +64,9 @@ def _word(value: str) -> str:
         return re.sub(r"[^\w.=,+-]", "-", value)
 
 
-def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
+def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print, count: int | None = None) -> int:
     """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
-    code = train_points(points, out, cache, say)
+    code = train_points(points, out, cache, say, count)
     if code == 0:
         say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
         say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
@@ -74,12 +74,19 @@ def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = prin
 
 
 def reproduce(
-    name: str, budget: str, out: pathlib.Path, form: str = "text", cache: bool = True, say: Say = print
+    name: str,
+    budget: str,
+    out: pathlib.Path,
+    form: str = "text",
+    cache: bool = True,
+    say: Say = print,
+    count: int | None = None,
 ) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
 
     Args:
       name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
+      count: of devices, as for `experiment.train`.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
@@ -96,7 +103,7 @@ def reproduce(
     for points in plans.values():
         setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
     for task, points in plans.items():
-        code = train_points(points, out / task, cache, say)
+        code = train_points(points, out / task, cache, say, count)
         if code:
             return code
     rows = table.rows([out / task / point for task, points in plans.items() for point in points])
@@ -106,11 +113,14 @@ def reproduce(
 
 
 def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
-    steps = budget["steps"]
-    return grid(task, {"method": methods}, **{**budget, "steps": steps[task] if isinstance(steps, dict) else steps})
+    """A budget's settings for all tasks, then those of this one."""
+    shared = {name: value for name, value in budget.items() if name != "tasks"}
+    return grid(task, {"method": methods}, **{**shared, **budget.get("tasks", {}).get(task, {})})
 
 
-def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print) -> int:
+def train_points(
+    points: Points, out: pathlib.Path, cache: bool = True, say: Say = print, count: int | None = None
+) -> int:
     """Trains what is missing of `points`, each into its own folder under `out`.
 
     Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
@@ -128,7 +138,7 @@ def train_points(points: Points, out: pathlib.Path, cache: bool = True, say: Say
     for number, (folder, group) in enumerate(groups, 1):
         first = next(iter(group.values()))
         say(f"program {number} of {len(groups)}: {len(group)} point(s) x {first.seeds} seed(s) side by side")
-        code = _train_group(folder, group, cache, say)
+        code = _train_group(folder, group, cache, say, count)
         if code:
             return code
         _cut(folder, group, out)
@@ -164,7 +174,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say) -> int:
+def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say, count: int | None) -> int:
     """Trains the points of one program side by side, or goes on with it."""
     try:
         (folder / "points").mkdir(parents=True, exist_ok=True)
@@ -180,7 +190,7 @@ def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say) -> 
     lanes = Lanes(own if len(group) > 1 else settings[0], seed)  # settings that are shared keep the last bits of a run
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
-    return experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes)
+    return experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes, count=count)
 
 
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:

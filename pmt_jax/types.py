@@ -146,34 +146,45 @@ class PolicyRows:
 
 
 @pytree
-class LearnerState:
-    """All that training carries; saving it and loading it continues the run bit for bit.
+class ActingState:
+    """What of a learner state acts: all that evaluations, pictures and exports need.
 
     Attributes:
       actor: weights with a leading agent axis.
+      obs_moments: [O], of raw observations.
+      update: [] int32, updates done.
+    """
+
+    actor: Trained
+    obs_moments: Moments
+    update: jax.Array
+
+
+@pytree
+class LearnerState(ActingState):
+    """All that training carries; saving it and loading it continues the run bit for bit.
+
+    Attributes:
+      actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         that do not feel them.
       multiplier: [N, K], lambda.
       episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier answers to.
-      obs_moments [O], state_moments [S]: of raw observations and states.
+      state_moments: [S], of raw states.
       rollout: environments and running sums.
       key: the run's key; update u draws from fold_in(key, u).
-      update: [] int32, updates done.
     """
 
-    actor: Trained
     critic: Critic
     cost_critic: Critic
     fear: Trained | None
     regret: Trained | None
     multiplier: jax.Array
     episode_cost: jax.Array
-    obs_moments: Moments
     state_moments: Moments
     rollout: RolloutState
     key: jax.Array
-    update: jax.Array
 
 
 @pytree

@@ -282,6 +282,18 @@ def test_fingertips_feel_the_egg_and_not_their_own_weight(holding):
     assert np.linalg.norm(weight, axis=-1).max(axis=-1).mean() > 0.5  # 10 x N; the egg weighs 0.74 N
 
 
+def test_c_engine_reads_the_sensors_that_plain_steps_leave_behind():
+    env, state = made(), jax.tree.map(lambda x: x[:4], starts())
+    after, out = jax.vmap(env._engine.step)(state.carry.physics, jnp.zeros((4, 40)))
+    data = mujoco.MjData(env.model)
+    for i in range(4):
+        mujoco.mj_resetData(env.model, data)
+        data.qpos[:] = state.carry.physics.qpos[i]
+        mujoco.mj_step(env.model, data, hand_over.SUBSTEPS)
+        np.testing.assert_array_equal(after.qvel[i], data.qvel.astype(np.float32))
+        np.testing.assert_array_equal(out["sensors"][i], data.sensordata.astype(np.float32))
+
+
 @pytest.fixture(scope="session")
 def both_engines():
     """1,000 random-policy states one control step on, by C and by MJX, with the egg on which they agree."""

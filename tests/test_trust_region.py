@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax.trust_region import backtrack, conjugate_gradient, constrained_direction
+from pmt_jax.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
 
 G = jnp.asarray([-1.0, 0.0])
 
@@ -72,6 +72,14 @@ def test_conjugate_gradient():
     h = jnp.asarray([1.0, 2.0, 5.0])
     np.testing.assert_allclose(conjugate_gradient(lambda v: h * v, jnp.ones(3), 3), 1 / h, rtol=1e-5)
     np.testing.assert_array_equal(conjugate_gradient(lambda v: h * v, jnp.zeros(3)), 0)
+
+
+def test_uncoupled_entries_are_solved_exactly_however_small_their_curvature():
+    """As a policy's deviations beside a network whose curvatures lie orders of magnitude apart."""
+    h, b = jnp.r_[jnp.logspace(0, 4, 40), 0.15, 0.2], jnp.ones(42).at[:40].set(10.0)
+    uncoupled = jnp.arange(42) >= 40
+    np.testing.assert_allclose(solve(lambda v: h * v, b, uncoupled)[40:], 1 / h[40:], rtol=1e-6)
+    assert (solve(lambda v: h * v, b)[40:] < 0.5 / h[40:]).all()
 
 
 def test_line_search_takes_the_first_that_is_accepted():

@@ -46,6 +46,22 @@ def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monk
     assert code == 0 and "info/tilt" in text
 
 
+def test_training_stops_where_the_physics_lost_contacts(tmp_path: pathlib.Path, cli):
+    """As MJX-Warp says it did where its buffers were too small; here from the fourth control step on."""
+    (tmp_path / "lossy.py").write_text(
+        "import dataclasses\nfrom envs.toys import Lane\n\nclass Lossy(Lane):\n"
+        "    def restore(self, **raw):\n        return self._said(super().restore(**raw))\n"
+        "    def step(self, state, action):\n        return self._said(super().step(state, action))\n"
+        "    def _said(self, state):\n        lost = (state.carry.time >= 4).astype('float32')\n"
+        "        return dataclasses.replace(state, info={**state.info, 'physics_overflow': lost})\n"
+    )
+    source, out = tmp_path / "lossy.py:Lossy", tmp_path / "run"
+    code, text, _ = cli("train", source, *TINY, "--rollout-length", 3, "--log-interval", 1, "--steps", 36, "--out", out)
+    assert code == 1 and "stopped: the warp engine had no room for all contacts" in text and "up to step 24" in text
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [row["info/physics_overflow"] for row in rows] == [0.0, 1.0]  # what broke the run is on record
+
+
 GOOD = EXAMPLE.read_text()
 
 

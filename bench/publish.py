@@ -1,0 +1,140 @@
+"""Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
+
+    python -m bench.publish runs/paper/ant_2x4/*    writes pmt_jax/hub/TASK-METHOD.npz, one for each run folder
+    python -m bench.publish                         only writes anew what is told about all of them
+
+What is told: bench/results/hub.json and the table in docs/pretrained.md. All figures are means over the same whole
+episodes under mean actions; a policy is better by the rule that `best` checkpoints are kept by (docs/runs.md), but
+those of methods without a constraint by their reward alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pmt_jax import pretrained, rollout, tasks
+from pmt_jax.compiling import use_cache
+from pmt_jax.errors import UsageError
+from pmt_jax.evaluation import improves
+from pmt_jax.experiment import evaluate_states
+from pmt_jax.folder import WHICH, load_saved
+from pmt_jax.run import Run
+from pmt_jax.types import ActingState, Trained
+
+from . import records, render
+
+
+def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
+    """Makes the best policy of a run the pretrained one of its task and method; returns what is told about it.
+
+    Raises:
+      UsageError: no run to be loaded, or one of a task that is not the package's own.
+    """
+    run, which, row, state = choose(folder, episodes)
+    config = run.config
+    if config.task not in tasks.names():
+        raise UsageError(f"{folder} is of a task of your own, which the package does not have; use pmt export")
+    packed = pretrained.rounded(state)
+    facts = {
+        "task": config.task,
+        "method": config.method,
+        "seed": row["seed"],
+        "which": which,
+        "step": row["step"],
+        "cost_limit": row["cost_limit"],
+        "episodes": episodes,
+        "engine": run.vector.env.engine,
+        "figures": figures(evaluate_states(run, packed, episodes, deterministic=True)[0]),
+        "unpacked": {name: figures(row)[name] for name in ("episode_reward", "episode_cost")},
+        "action_change": action_change(run, packed, state),
+        "training": json.loads((folder / "versions.json").read_text()),
+    }
+    pretrained.save(f"{pretrained.PREFIX}{config.task}/{config.method}", config, state, facts)
+    return facts
+
+
+def choose(folder: pathlib.Path, episodes: int) -> tuple[Run, str, dict[str, Any], ActingState]:
+    """The best of all seeds, last and best, of a run.
+
+    Returns:
+      the run, `last` or `best`, the seed's row of `evaluate_run`, and what acts, with a leading [1].
+    """
+    run, _, saved = load_saved(folder, "auto")
+    states = [saved["last"], saved["best"].state]
+    acting = [ActingState(Trained(state.actor.params, None), state.obs_moments, state.update) for state in states]
+    both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
+    rows = evaluate_states(run, both, episodes, deterministic=True)
+    reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
+    # Who never heard of a limit is not held to it: else MAPPO's best would be what it was before it had learned much.
+    limit = np.inf if run.method.constraint == "none" else run.cost_limit
+    chosen, reached = None, (np.array(-np.inf), np.array(np.inf))
+    for i, new in enumerate(zip(reward, cost, strict=True)):
+        if improves(*new, *reached, limit):
+            chosen, reached = i, new
+    if chosen is None:
+        raise UsageError(f"no policy in {folder} has figures that are numbers")
+    which, seed = divmod(chosen, run.config.seeds)
+    row = rows[chosen] | {"seed": run.config.seed + seed}
+    return run, WHICH[which], row, jax.tree.map(lambda x: x[chosen : chosen + 1], both)
+
+
+def figures(row: dict[str, Any]) -> dict[str, list[float]]:
+    """The means and half-widths of an evaluation's row."""
+    return {name: [round(float(x), 6) for x in pair] for name, pair in row.items() if isinstance(pair, tuple)}
+
+
+def action_change(run: Run, packed: ActingState, original: ActingState, environments: int = 8) -> float:
+    """How far packing moves the mean action, in the action's unit, mean over the entries that an agent has.
+
+    Taken in the states of one episode of the packed policy, actions sampled, in each of a few environments.
+    """
+    vector = tasks.VectorEnv(run.vector.env, environments)
+
+    def change(key: jax.Array, packed: ActingState, original: ActingState) -> jax.Array:
+        normalisers = (functools.partial(run.scale, packed.obs_moments), lambda state: state)
+        policy = functools.partial(run.nets.policies, packed.actor.params)
+        start = rollout.start(vector, key)
+        _, batch, _ = rollout.collect(vector, start, policy, normalisers, key, vector.horizon)
+        moved = jnp.abs(run.nets.policies(original.actor.params, batch.obs)[0] - batch.mean)
+        return (moved.mean((0, 1)) * vector.spec.action_mask).sum() / vector.spec.action_mask.sum()
+
+    one = jax.tree.map(lambda x: x[0], (packed, original))
+    return round(float(jax.jit(change)(jax.random.key(0), *one)), 6)
+
+
+def rows() -> records.Rows:
+    """What is told about every pretrained policy, and its size in bytes."""
+    return [
+        {"name": name, "bytes": pretrained.file_of(name).stat().st_size, **pretrained.about(name)}
+        for name in pretrained.names()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", type=pathlib.Path, metavar="RUNFOLDER")
+    parser.add_argument("--episodes", type=int, default=64)
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("bench/results/hub.json"))
+    arguments = parser.parse_args()
+    use_cache()
+    for folder in arguments.folders:
+        try:
+            facts = publish(folder, arguments.episodes)
+        except UsageError as error:
+            parser.error(str(error))
+        reward, cost = (facts["figures"][f"episode_{what}"][0] for what in ("reward", "cost"))
+        print(f"{folder}: seed {facts['seed']}, {facts['which']}, reward {reward:.2f}, cost {cost:.2f}", flush=True)
+    records.write(arguments.out, rows())
+    render.documents_anew(check=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""Pretrained policies: what comes back is what was trained, and a newcomer can use it by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import pathlib
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from bench import publish, tables
+from pmt_jax import experiment, folder, learner, load_config, load_policy, normalise, numpy_policy, pretrained, setup
+from pmt_jax.checkpoint import Checkpoints
+from pmt_jax.types import ActingState, LearnerState, Moments, Trained
+
+ROOT = pathlib.Path(__file__).parent.parent
+NAMES = pretrained.names()
+
+
+@pytest.fixture
+def hub(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
+    """An empty place for policies."""
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "hub")
+    return tmp_path / "hub"
+
+
+def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, float]) -> pathlib.Path:
+    """A run folder of seeds 3 and 4 on the lane, whose policies always do about the same: push so hard."""
+    run = setup(load_config("lane", method="r4sg", seeds=2, seed=3, num_envs=4, hidden=[8]))
+    hyper, keys, axes = run.side_by_side
+    state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
+
+    def pushing(actions: tuple[float, float]) -> LearnerState:
+        params = jax.tree.map(lambda x: x, state.actor.params)
+        head = params["params"]["trunk"]["Dense_1"]
+        head["bias"] = head["bias"] + jnp.array(actions)[:, None, None]
+        return dataclasses.replace(state, actor=dataclasses.replace(state.actor, params=params))
+
+    out.mkdir()
+    folder.write_settings(out, run)
+    checkpoints = Checkpoints(out)
+    known = dataclasses.replace(folder.first_best(state), state=pushing(best))
+    checkpoints.save(100, {"last": pushing(last), "best": known})
+    checkpoints.close()
+    return out
+
+
+def test_the_best_policy_of_a_run_is_published_and_used_by_name(hub: pathlib.Path, tmp_path: pathlib.Path, cli):
+    # The lane's point comes to rest at twice the push; beyond 0.5 it costs, the nearer to 1 the better.
+    out = untrained(tmp_path / "lane", last=(0.5, 0.0), best=(0.2, 0.1))
+    facts = publish.publish(out, 8)
+    assert [p.relative_to(hub).as_posix() for p in hub.rglob("*.npz")] == ["lane-r4sg.npz"]
+    assert pretrained.about("hub:lane/r4sg") == facts
+    assert (facts["seed"], facts["which"]) == (3, "best") and facts["figures"]["episode_cost"] == [0, 0]
+
+    mean, half = facts["figures"]["episode_reward"]
+    code, text, _ = cli("eval", "hub:lane/r4sg", "--episodes", 8, "--deterministic")
+    assert code == 0 and f"{mean:12.4f} +- {half:.4f}" in text and "seed 3 after 0 steps (cost limit 1" in text
+    code, text, _ = cli("hub")
+    assert code == 0 and f"hub:lane/r4sg                reward {mean:9.2f}" in text
+
+    obs = jax.random.normal(jax.random.key(2), (2, 8))
+    action = load_policy("hub:lane/r4sg")(obs)
+    np.testing.assert_allclose(action, load_policy(out, 3, "best")(obs), atol=1e-3)
+    assert 0 < facts["action_change"] < 1e-3
+    assert cli("export", "hub:lane/r4sg", "-o", tmp_path / "policy")[0] == 0
+    np.testing.assert_allclose(numpy_policy.load(tmp_path / "policy" / "policy.npz")(np.array(obs)), action, atol=1e-5)
+    assert cli("render", "hub:lane/r4sg", "-o", tmp_path / "lane.html")[0] == 0
+    assert "seed 3" in (tmp_path / "lane.html").read_text()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    hnp.arrays(np.float32, hnp.array_shapes(min_dims=4, max_dims=4, max_side=3), elements=st.floats(-9, 9, width=32))
+)
+def test_packing_loses_at_most_half_a_level_of_a_kernel_and_nothing_else(kernel: np.ndarray):
+    rest = jnp.asarray(kernel[..., 0, :])
+    state = ActingState(Trained({"kernel": jnp.asarray(kernel), "bias": rest}, None), Moments(rest, rest, rest), rest)
+    packed = pretrained.rounded(state)
+    half = np.abs(kernel).max(-2, keepdims=True) / pretrained.LEVELS / 2
+    assert (np.abs(packed.actor.params["kernel"] - kernel) <= half * (1 + 1e-4) + 1e-30).all()
+    others = (packed.actor.params["bias"], packed.obs_moments, packed.update)
+    assert all((x == rest).all() for x in jax.tree.leaves(others))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (
+            ["eval", "hub:lane/r4gs"],
+            "unknown policy 'hub:lane/r4gs'; did you mean 'hub:lane/r4sg'? (pmt hub lists all)",
+        ),
+        (["render", "hub:lane", "-o", "x.html"], "unknown policy 'hub:lane'; did you mean 'hub:lane/r4sg'?"),
+        (["export", "hub:../lane/r4sg", "-o", "x"], "unknown policy 'hub:../lane/r4sg'"),
+        (["render", "hub:lane/r4sg", "--seed", "7", "-o", "x.html"], "has no seed 7; it has 3"),
+    ],
+)
+def test_names_that_are_none(arguments: list[str], says: str, hub: pathlib.Path, cli, tmp_path, monkeypatch):
+    run = setup(load_config("lane", hidden=[8]))
+    actor = jax.vmap(run.nets.init_actor)(jax.random.split(jax.random.key(0), 1))
+    moments = jax.tree.map(lambda x: x[None], normalise.init((8,)))
+    state = ActingState(Trained(actor, None), moments, jnp.zeros(1, jnp.int32))
+    pretrained.save("hub:lane/r4sg", run.config, state, {"seed": 3})
+    monkeypatch.chdir(tmp_path)
+    code, out, err = cli(*arguments)
+    assert code == 2 and not out
+    assert says in err and err.startswith("pmt: ") and err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["hub"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Those that come with the package
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_of_the_package(name: str):
+    run, state = pretrained.load(name)
+    facts = pretrained.about(name)
+    assert f"hub:{run.config.task}/{run.config.method}" == name == f"hub:{facts['task']}/{facts['method']}"
+    assert (run.config.seed, run.config.seeds, run.config.physics) == (facts["seed"], 1, "auto")
+    assert run.cost_limit == facts["cost_limit"]
+    assert int(state.update[0]) * run.config.batch_size == facts["step"]
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(state))
+
+
+def test_what_is_told_about_them_and_how_large_they_are():
+    told = publish.rows()
+    assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == told
+    assert tables.hub({"hub": {"rows": told}}) in (ROOT / "docs" / "pretrained.md").read_text()
+    assert sum(row["bytes"] for row in told) < 3e6
+
+
+def test_they_come_with_the_wheel():
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert "pmt_jax.hub" in table["packages"]
+    inside = {file for pattern in table["package-data"]["pmt_jax.hub"] for file in pretrained.FOLDER.glob(pattern)}
+    assert inside >= {pretrained.file_of(name) for name in NAMES}
+
+
+def test_packing_costs_no_reward_and_no_safety():
+    """Of many 95 % intervals, a few may miss."""
+    apart = []
+    for name in NAMES:
+        facts = pretrained.about(name)
+        for figure, (before, half) in facts["unpacked"].items():
+            after, other_half = facts["figures"][figure]
+            apart.append(abs(after - before) > half + other_half)
+        assert facts["action_change"] < 0.02
+    assert np.mean(apart) <= 0.05
+
+
+def test_a_trained_ant_runs_as_it_is_told():
+    """Other episodes than the published ones, on the C engine: the two intervals meet."""
+    [row] = experiment.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")
+    (ours, half), told = row["episode_reward"], pretrained.about("hub:ant_2x4/mappo_l")["figures"]
+    assert abs(ours - told["episode_reward"][0]) <= half + told["episode_reward"][1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_every_policy_is_as_good_as_it_is_told(name: str):
+    told = pretrained.about(name)
+    [row] = experiment.evaluate_run(pathlib.Path(name), told["episodes"], True)
+    for figure in ("episode_reward", "episode_cost"):
+        mean, half = told["figures"][figure]
+        assert abs(row[figure][0] - mean) <= half + row[figure][1]
