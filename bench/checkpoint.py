@@ -4,7 +4,7 @@ python -m bench.checkpoint --out bench/results/checkpoint.json
 
 A 256-environment run of `mixed`, the method with the most networks, is trained for a while, so that its weights
 compress as those of a real run do. `overhead` is what checkpoints take of wall time at the default interval: a save
-every CHECKPOINT_SECONDS, and after every chunk a copy of the state, as if each were the best so far.
+every CHECKPOINT_SECONDS (`interval`, s), and after every chunk a copy of the state, as if each were the best so far.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.physics import usable_cpus
 from pmt_jax import checkpoint, experiment, folder, load_config
 from pmt_jax.compiling import compile_run, use_cache
 from pmt_jax.run import setup
+
+from . import records
 
 
 def seconds(work: Callable[[], Any]) -> float:
@@ -59,13 +60,17 @@ def measure(chunks: int, repeats: int) -> dict[str, Any]:
         checkpoints.close()
     save, chunk, keep = (statistics.median(x) for x in (save_seconds[1:], chunk_seconds[1:], keep_seconds[1:]))
     return {
+        "task": "ant_2x4",
+        "method": "mixed",
+        "num_envs": 256,
         "checkpoint_mb": round(size / 1e6, 3),
-        "first_save_s": round(save_seconds[0], 3),
-        "save_s": round(save, 3),
-        "load_s": round(statistics.median(load_seconds), 3),
-        "chunk_s": round(chunk, 3),
-        "keep_best_s": round(keep, 5),
+        "first_save_seconds": round(save_seconds[0], 3),
+        "save_seconds": round(save, 3),
+        "load_seconds": round(statistics.median(load_seconds), 3),
+        "chunk_seconds": round(chunk, 3),
+        "keep_best_seconds": round(keep, 5),
         "overhead": round(save / experiment.CHECKPOINT_SECONDS + keep / chunk, 5),
+        "interval": experiment.CHECKPOINT_SECONDS,
     }
 
 
@@ -77,11 +82,9 @@ def main() -> None:
     arguments = parser.parse_args()
     use_cache()
     result = measure(arguments.chunks, arguments.repeats)
-    result["interval_s"] = experiment.CHECKPOINT_SECONDS
-    result["versions"] = {"jax": jax.__version__, "orbax": folder.version("orbax-checkpoint"), "cpus": usable_cpus()}
     print(json.dumps(result, indent=1))
     if arguments.out:
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        records.write(arguments.out, [result], ("orbax-checkpoint",))
 
 
 if __name__ == "__main__":

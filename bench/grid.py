@@ -1,7 +1,8 @@
 """Power flows and environment steps per second, against the tools that grid engineers use.
 
   pip install pandapower lightsim2grid power-grid-model
-  python bench/grid.py [--seconds 1.0] [--rounds 7] [--out bench/results/grid.json]
+  python -m bench.grid [--seconds 1.0] [--rounds 7] --out bench/results/grid.json
+  python -m bench.grid --quick                    environment steps only, which needs none of the tools
 
 All contestants take turns on the same random states, so that other load on the machine falls on all alike; ratios are
 medians over the rounds. A power flow starts from a set of injections and ends with voltages of all buses and losses
@@ -11,11 +12,8 @@ of all lines in the caller's memory. Nobody keeps the previous solution as a sta
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import json
 import os
-import platform
-import subprocess
 import time
 import warnings
 from collections.abc import Callable
@@ -29,14 +27,14 @@ import numpy as np
 import envs
 from envs import power_flow
 from envs.vector import VectorEnv
+from pmt_jax.errors import UsageError, optional
+
+from . import records
+from .records import Rows
 
 Run = Callable[[], Any]
-TOOLS = ("jax", "jaxlib", "numpy", "pandapower", "lightsim2grid", "power-grid-model")
-TARGETS = {  # ratios the project asks for
-    "case33": {"ours f32 / power-grid-model, batch 1024": 5.0, "ours f32 / lightsim2grid, single": 1.0},
-    "case141": {"ours f32 / power-grid-model, batch 1024": 3.0, "ours f32 / lightsim2grid, single": 1.0},
-}
-STEP_TARGETS = {"voltage_33": 30_000, "voltage_141": 8_000}
+TOOLS = {"pandapower": "pandapower", "lightsim2grid": "lightsim2grid", "power_grid_model": "power-grid-model"}
+CASES, TASKS = ("case33", "case141"), ("voltage_33", "voltage_141")
 
 
 def states(case: str, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -190,64 +188,62 @@ def rate(run: Run, seconds: float, flows: int) -> float:
     return count * flows / spent
 
 
-def power_flow_table(case: str, rounds: int, seconds: float) -> dict:
+def power_flows(case: str, rounds: int, seconds: float) -> Rows:
+    """A row per contestant, then one per ratio between two of them."""
     p, q = states(case, 1024)
     threads = len(os.sched_getaffinity(0))
-    batch = {
-        "ours f32": ours(case, p, q, "float32", 1e-6),
-        "ours f64": ours(case, p, q, "float64", 1e-8),
-        **{
-            f"power-grid-model {method}": pgm_runs(case, p, q, method, threads)
-            for method in ("iterative_current", "newton_raphson")
-        },
+    contestants = {
+        ("ours f32", 1024): ours(case, p, q, "float32", 1e-6),
+        ("ours f64", 1024): ours(case, p, q, "float64", 1e-8),
+        ("power-grid-model iterative_current", 1024): pgm_runs(case, p, q, "iterative_current", threads),
+        ("power-grid-model newton_raphson", 1024): pgm_runs(case, p, q, "newton_raphson", threads),
+        ("ours f32", 1): ours(case, p[0], q[0], "float32", 1e-6),
+        ("ours f64", 1): ours(case, p[0], q[0], "float64", 1e-8),
+        ("lightsim2grid", 1): lightsim_runs(case, p[0], q[0], True),
+        ("lightsim2grid, solve only", 1): lightsim_runs(case, p[0], q[0], False),
+        ("pandapower", 1): pandapower_runs(case, p[0], q[0]),
     }
-    single = {
-        "ours f32": ours(case, p[0], q[0], "float32", 1e-6),
-        "ours f64": ours(case, p[0], q[0], "float64", 1e-8),
-        "lightsim2grid": lightsim_runs(case, p[0], q[0], True),
-        "lightsim2grid, solve only": lightsim_runs(case, p[0], q[0], False),
-        "pandapower": pandapower_runs(case, p[0], q[0]),
-    }
-    reference = np.asarray(batch["ours f64"][1]())
+    reference = np.asarray(contestants["ours f64", 1024][1]())
     errors = {}
-    for size, contestants in (("1024", batch), ("1", single)):
-        for name, (run, voltages) in contestants.items():
-            run()
-            error = np.max(np.abs(np.asarray(voltages()) - (reference if size == "1024" else reference[0])))
-            assert error < 1e-4, f"{name} disagrees by {error}"
-            errors[f"{name}, {size}"] = float(error)
-    rates = {f"{name}, batch 1024": [] for name in batch} | {f"{name}, single": [] for name in single}
-    for _ in range(rounds):
-        for name, (run, _) in batch.items():
-            rates[f"{name}, batch 1024"].append(rate(run, seconds, len(p)))
-        for name, (run, _) in single.items():
-            rates[f"{name}, single"].append(rate(run, seconds / 2, 1))
-    rounds_of = {k: np.array(v) for k, v in rates.items()}
-    pgm = np.maximum(*(rounds_of[f"power-grid-model {m}, batch 1024"] for m in ("iterative_current", "newton_raphson")))
-    ratios = {
-        "ours f32 / power-grid-model, batch 1024": rounds_of["ours f32, batch 1024"] / pgm,
-        "ours f64 / power-grid-model, batch 1024": rounds_of["ours f64, batch 1024"] / pgm,
-        "ours f32 / lightsim2grid, single": rounds_of["ours f32, single"] / rounds_of["lightsim2grid, single"],
-        "ours f64 / lightsim2grid, single": rounds_of["ours f64, single"] / rounds_of["lightsim2grid, single"],
-        "ours f32 / lightsim2grid solve only, single": rounds_of["ours f32, single"]
-        / rounds_of["lightsim2grid, solve only, single"],
-        "ours f32, batch 1024 / pandapower": rounds_of["ours f32, batch 1024"] / rounds_of["pandapower, single"],
-    }
-    return {
-        "flows_per_second": {k: round(float(np.median(v)), 1) for k, v in rounds_of.items()},
-        "ratio": {
-            k: {
-                "median": round(float(np.median(v)), 2),
-                "worst": round(float(v.min()), 2),
-                "target": TARGETS[case].get(k),
-            }
-            for k, v in ratios.items()
-        },
-        "largest_difference_pu": errors,
-    }
+    for (name, batch), (run, voltages) in contestants.items():
+        run()
+        errors[name, batch] = float(np.max(np.abs(np.asarray(voltages()) - (reference if batch > 1 else reference[0]))))
+        assert errors[name, batch] < 1e-4, f"{name} disagrees by {errors[name, batch]}"
+    rates = {key: np.zeros(rounds) for key in contestants}
+    for i in range(rounds):
+        for (name, batch), (run, _) in contestants.items():
+            rates[name, batch][i] = rate(run, seconds if batch > 1 else seconds / 2, batch)
+    rows = [
+        {
+            "case": case,
+            "what": name,
+            "batch": batch,
+            "flows_per_second": round(float(np.median(found)), 1),
+            "largest_difference_pu": errors[name, batch],
+        }
+        for (name, batch), found in rates.items()
+    ]
+    return [*rows, *({"case": case, **row} for row in ratios(rates))]
 
 
-def steps_table(task: str, rounds: int, seconds: float, batch: int = 256, length: int = 60) -> dict:
+def ratios(rates: dict[tuple[str, int], np.ndarray]) -> Rows:
+    """A row per ratio: median and lowest over rounds; power-grid-model counts with the faster of its two methods."""
+    pgm = np.maximum(*(rates[f"power-grid-model {m}", 1024] for m in ("iterative_current", "newton_raphson")))
+    found = {
+        ("ours f32 / power-grid-model", 1024): rates["ours f32", 1024] / pgm,
+        ("ours f64 / power-grid-model", 1024): rates["ours f64", 1024] / pgm,
+        ("ours f32 / lightsim2grid", 1): rates["ours f32", 1] / rates["lightsim2grid", 1],
+        ("ours f64 / lightsim2grid", 1): rates["ours f64", 1] / rates["lightsim2grid", 1],
+        ("ours f32 / lightsim2grid, solve only", 1): rates["ours f32", 1] / rates["lightsim2grid, solve only", 1],
+        ("ours f32 / pandapower", 1024): rates["ours f32", 1024] / rates["pandapower", 1],
+    }
+    return [
+        {"what": what, "batch": batch, "ratio": round(float(np.median(x)), 2), "lowest": round(float(x.min()), 2)}
+        for (what, batch), x in found.items()
+    ]
+
+
+def steps(task: str, rounds: int, seconds: float, batch: int = 256, length: int = 60) -> Rows:
     """Environment steps per second with random actions, noise, auto-reset, observation and state."""
     vector = VectorEnv(envs.make(task), batch)
     actions = (batch, vector.spec.num_agents, 1)
@@ -276,47 +272,44 @@ def steps_table(task: str, rounds: int, seconds: float, batch: int = 256, length
         rates["one call a step"].append(
             rate(lambda: jax.block_until_ready(stepped(state, action)[1].next_obs), seconds, batch)
         )
-    return {
-        "batch": batch,
-        "steps_per_second": {k: {"median": round(np.median(v)), "worst": round(min(v))} for k, v in rates.items()},
-        "target": STEP_TARGETS[task],
-    }
-
-
-def machine() -> dict:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    info = Path("/proc/cpuinfo")
-    names = (
-        [x.split(":")[1].strip() for x in info.read_text().splitlines() if "model name" in x] if info.exists() else []
-    )
-    return {
-        "cpu": names[0] if names else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "load_average": [round(x, 1) for x in os.getloadavg()],
-        "backend": jax.default_backend(),
-        "python": platform.python_version(),
-        "versions": {tool: importlib.metadata.version(tool) for tool in TOOLS},
-        "commit": commit.stdout.strip(),
-    }
+    return [
+        {
+            "task": task,
+            "what": what,
+            "batch": batch,
+            "steps_per_second": round(np.median(found)),
+            "lowest": round(min(found)),
+        }
+        for what, found in rates.items()
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each slice")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "grid.json")
+    parser.add_argument("--quick", action="store_true", help="environment steps only")
+    parser.add_argument("--out", type=Path, help="a JSON file for the rows")
     args = parser.parse_args()
     jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
     # Handing work to another thread takes 20 us, which a caller that waits for every single answer can save.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    results = {"machine": machine()}
-    for case in ("case33", "case141"):
-        results[case] = power_flow_table(case, args.rounds, args.seconds)
-        print(json.dumps({case: results[case]}, indent=2), flush=True)
-    for task in STEP_TARGETS:
-        results[task] = steps_table(task, args.rounds, args.seconds)
-        print(json.dumps({task: results[task]}, indent=2), flush=True)
-    args.out.write_text(json.dumps(results, indent=2) + "\n")
+    rows: Rows = []
+    if not args.quick:
+        try:
+            for module in TOOLS:
+                optional(module, "bench")
+        except UsageError as error:
+            raise SystemExit(f"bench.grid: {error}") from error
+        for case in CASES:
+            rows += power_flows(case, args.rounds, args.seconds)
+    for task in TASKS:
+        rows += steps(task, args.rounds, args.seconds)
+    for row in rows:
+        print(json.dumps(row))
+    if args.out is not None:
+        settings = {"rounds": args.rounds, "seconds": args.seconds}
+        records.write(args.out, rows, tuple(TOOLS.values()), settings=settings)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """What an emotion or a trust region costs: seconds of compiling and per update of every method, at equal batch.
 
     python -m bench.methods --out bench/results/methods.json     about ten minutes on two cores
-    python -m bench.methods --from bench/results/methods.json    prints the table
 
 Methods take turns, one update each; figures are medians over rounds, ratios are medians over rounds of the ratio to
 MAPPO-Lagrangian in the same round. `ant_2x4` is the whole training loop; `switch` with the ant's batch and networks has
@@ -21,7 +20,8 @@ import jax
 
 from pmt_jax import METHODS, learner, load_config, setup
 
-from . import records
+from . import records, turns
+from .tables import of_methods
 
 REFERENCE = "mappo_l"
 SIZE = {"num_envs": 64, "rollout_length": 64, "epochs": 5, "minibatches": 8, "hidden": (128, 128), "log_interval": 1}
@@ -30,19 +30,10 @@ TASKS: dict[str, dict[str, Any]] = {"ant_2x4": SIZE, "switch": LIKE_THE_ANT}
 
 
 @dataclasses.dataclass
-class Contestant:
-    """A method's compiled update and its state."""
+class Contestant(turns.Contestant):
+    """A method's compiled update."""
 
     method: str
-    state: Any
-    update: Any
-    compile_seconds: float
-    seconds: list[float] = dataclasses.field(default_factory=list)
-
-    def turn(self) -> None:
-        begin = time.perf_counter()
-        self.state, _ = jax.block_until_ready(self.update(self.state))
-        self.seconds.append(time.perf_counter() - begin)
 
 
 def enter(task: str, method: str) -> Contestant:
@@ -51,7 +42,7 @@ def enter(task: str, method: str) -> Contestant:
     state = jax.jit(lambda key: learner.init(run, run.hyper, key))(jax.random.key(0))
     begin = time.perf_counter()
     update = jax.jit(lambda s: learner.train_chunk(run, run.hyper, s, 1)).lower(state).compile()
-    return Contestant(method, state, update, time.perf_counter() - begin)
+    return Contestant(state, update, time.perf_counter() - begin, method)
 
 
 def measure(task: str, rounds: int) -> list[dict[str, Any]]:
@@ -80,33 +71,16 @@ def measure(task: str, rounds: int) -> list[dict[str, Any]]:
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown."""
-    lines = [
-        "| task | method | compile, s (x MAPPO-L) | update, s (x MAPPO-L) | steps/s (x MAPPO-L) |",
-        "|---|---|---|---|---|",
-    ]
-    for r in rows:
-        lines.append(
-            f"| {r['task']} | {r['method']} | {r['compile_seconds']} ({r['compile_ratio']}) | "
-            f"{r['update_seconds']} ({r['update_ratio']}) | {r['steps_per_second']:,} ({r['throughput_ratio']}) |"
-        )
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--out", type=pathlib.Path)
-    parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
-    if arguments.source:
-        print(table(records.read(arguments.source)))
-        return
     rows = []
-    for task in TASKS:
+    for task in arguments.tasks:
         rows += measure(task, arguments.rounds)
-        print(table(rows), flush=True)
+        print(of_methods(rows), flush=True)
     if arguments.out:
         records.write(arguments.out, rows)
 

@@ -22,6 +22,7 @@ from pmt_jax import load_config, setup
 
 from . import records
 from .search import search
+from .tables import markdown
 from .toys import SIZES, interval
 
 SEEDS = 5
@@ -59,12 +60,15 @@ def measure(task: str, method: str, changes: dict[str, Any], faster: tuple[float
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = ["| task | method | cost at the end | cost while training | reward at the end |", "|---|---|---|---|---|"]
-    for row in rows:
-        changes = "".join(f", {k} = {v}" for k, v in row["changes"].items())
-        figures = " | ".join(interval(row[name], 2) for name in ("cost", "cost_all", "reward"))
-        lines.append(f"| {row['task']} | {row['method']}{changes} | {figures} |")
-    return "\n".join(lines)
+    body = [
+        [
+            row["task"],
+            row["method"] + "".join(f", {k} = {v}" for k, v in row["changes"].items()),
+            *(interval(row[name]) for name in ("cost", "cost_all", "reward")),
+        ]
+        for row in rows
+    ]
+    return markdown(("task", "method", "cost at the end", "cost while training", "reward at the end"), body)
 
 
 def main() -> None:

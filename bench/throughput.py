@@ -1,13 +1,15 @@
-"""Control steps per second of the corridor ant: plain loops over C MuJoCo, our environment alone, the whole training.
+"""Control steps per second of ant or hands: plain loops over C MuJoCo, our environment alone, the whole training.
 
 Measurements interleave and repeat, so that other work on the machine hits all alike; each waits a while for the other
 work to pause and notes how much of the machine it took. Compare medians and ratios. `of_plain_x_threads` compares with
 a plain loop on one thread, times the threads; `of_plain_at_once` with as many plain loops at once, which also share
-memory and clock. The plain loop takes the model as it is; our C engine skips MuJoCo's search for islands in it, which
-changes no bit and is worth 6 %.
+memory and clock. Where other work shares the machine, steps per CPU-second of this process say more than steps per
+second. The plain loop takes the model as it is; our C engine skips MuJoCo's search for islands in it, which changes no
+bit and is worth 6 % on the ant. Hands: the egg is an ellipsoid on `mujoco`, a capsule on `mjx`.
 
-python -m bench.throughput --out bench/results/throughput.json
-python -m bench.throughput --quick
+python -m bench.throughput ant_2x4 --out bench/results/throughput.json
+python -m bench.throughput hand_over_2x6 --out bench/results/hand_over.json
+python -m bench.throughput ant_2x4 --quick
 """
 
 # mujoco is a binary module without stubs:
@@ -15,12 +17,11 @@ python -m bench.throughput --quick
 from __future__ import annotations
 
 import argparse
-import datetime
+import dataclasses
 import functools
 import json
 import os
 import pathlib
-import platform
 import re
 import statistics
 import subprocess
@@ -29,7 +30,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,36 +39,114 @@ import numpy as np
 import psutil
 
 import envs
-from envs import ant_corridor
+from envs import ant_corridor, hand_over
 from envs.physics import usable_cpus
 from pmt_jax import learner, load_config
 from pmt_jax.run import setup
 
-ROUGH = {"mujoco": 5000.0, "mjx converged": 500.0, "mjx fast": 1000.0, "training": 4000.0}  # steps/s of one CPU
-TARGETS = {"mujoco": 0.85, "training": 0.7, "compile_s": 15.0, "second_start_s": 5.0, "rss_gb": 2.0}
-Measure = Callable[[], float]
+from . import records
+from .engines import Measure, env_alone, repeated
+from .records import Rows
+
+Head = dict[str, Any]  # what a row is about
 
 
-def plain_loop(steps: int) -> float:
+@dataclasses.dataclass(frozen=True)
+class Plain:
+    """What a plain loop needs of a task.
+
+    Attributes:
+      model: as the `mujoco` engine has it; substeps: physics steps in a control step.
+      reset: puts MjData where an episode begins; over: does what follows the physics, says whether the episode ended.
+    """
+
+    model: mujoco.MjModel
+    substeps: int
+    reset: Callable[[mujoco.MjData, np.random.Generator], None]
+    over: Callable[[mujoco.MjModel, mujoco.MjData], bool]
+
+
+def _reset_ant(data: mujoco.MjData, rng: np.random.Generator) -> None:
+    data.qpos += rng.uniform(-0.1, 0.1, len(data.qpos))
+    data.qvel[:] = 0.1 * rng.normal(size=len(data.qvel))
+
+
+def _ant_over(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+    mujoco.mj_rnePostConstraint(model, data)
+    upright = 1 - 2 * (data.xquat[1, 1] ** 2 + data.xquat[1, 2] ** 2)
+    return not (0.2 <= data.qpos[2] <= 1.0 and upright >= -0.7)
+
+
+def _reset_hands(data: mujoco.MjData, rng: np.random.Generator) -> None:
+    joints = data.model.jnt_range[: hand_over.JOINTS]
+    pose = joints[:, 0] + (joints[:, 1] - joints[:, 0]) * rng.uniform(-1, 1, hand_over.JOINTS)
+    data.qpos[: hand_over.HINGES] = hand_over.RESET_SPREAD * np.tile(pose, hand_over.HANDS)
+
+
+def _hands_over(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+    return not data.qpos[hand_over.HINGES + 2] > hand_over.FALLEN
+
+
+class Engine(NamedTuple):
+    """An engine by name, its options, and roughly the steps/s of the environment alone on one CPU."""
+
+    name: str
+    options: Head
+    rough: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is measured of a task.
+
+    Attributes:
+      plain: makes what the plain loop needs.
+      engines: those that the environment alone runs on; `--quick` takes the first.
+      batches: environments side by side; `--quick` takes the first two.
+      training: roughly the steps/s of training on one CPU; None where it is not measured.
+    """
+
+    plain: Callable[[], Plain]
+    engines: tuple[Engine, ...]
+    batches: tuple[int, ...]
+    training: float | None = None
+
+
+SUBJECTS = {
+    "ant_2x4": Subject(
+        lambda: Plain(ant_corridor.model(), ant_corridor.SUBSTEPS, _reset_ant, _ant_over),
+        (
+            Engine("mujoco", {}, 5000.0),
+            Engine("mjx", {"solver": "fast"}, 1000.0),
+            Engine("mjx", {"solver": "converged"}, 500.0),
+        ),
+        (16, 64, 256),
+        training=4000.0,
+    ),
+    "hand_over_2x6": Subject(
+        lambda: Plain(hand_over.model(), hand_over.SUBSTEPS, _reset_hands, _hands_over),
+        (Engine("mujoco", {}, 10_000.0), Engine("mjx", {}, 1500.0)),
+        (64, 256),
+    ),
+}
+
+
+def plain_loop(plain: Plain, steps: int) -> float:
     """Control steps/s of one thread of Python over C MuJoCo: random actions, reset where the task terminates."""
-    model = ant_corridor.model()
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (steps, model.nu))
+    model, data, rng = plain.model, mujoco.MjData(plain.model), np.random.default_rng(0)
+    low, high = model.actuator_ctrlrange.T
+    actions = rng.uniform(low, high, (steps, model.nu))
 
     def reset() -> None:
         mujoco.mj_resetData(model, data)
-        data.qpos += rng.uniform(-0.1, 0.1, model.nq)
-        data.qvel[:] = 0.1 * rng.normal(size=model.nv)
+        plain.reset(data, rng)
 
     reset()
     begin = time.perf_counter()
     for action in actions:
         data.ctrl[:] = action
-        mujoco.mj_step(model, data, ant_corridor.SUBSTEPS)
-        mujoco.mj_rnePostConstraint(model, data)
-        upright = 1 - 2 * (data.xquat[1, 1] ** 2 + data.xquat[1, 2] ** 2)
-        if not (0.2 <= data.qpos[2] <= 1.0 and upright >= -0.7):
+        mujoco.mj_step(model, data, plain.substeps)
+        if plain.over(model, data):
             reset()
     return steps / (time.perf_counter() - begin)
 
@@ -80,38 +159,9 @@ def at_once(loop: Callable[[int], float], threads: int, steps: int) -> float:
     return threads * steps / (time.perf_counter() - begin)
 
 
-def env_alone(batch: int, steps: int, task: str = "ant_2x4", **options: Any) -> Measure:
-    """jit(scan(vmap(step))) with random actions, and resets where an episode terminates."""
-    env = envs.make(task, **options)
-    spec = env.spec
-
-    def step(state, action_and_key):
-        action, key = action_and_key
-        after = jax.vmap(env.step)(state, action)
-
-        def restarted(after):
-            fresh = jax.vmap(env.reset)(jax.random.split(key, batch))
-
-            def either(new, old):
-                return jnp.where(after.terminated.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-            return jax.tree.map(either, fresh, after)
-
-        return jax.lax.cond(after.terminated.any(), restarted, lambda after: after, after), after.reward.sum()
-
-    shape = (steps, batch, spec.num_agents, spec.action_dim)  # drawn beforehand, as the plain loop's are
-    inputs = (
-        jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1),
-        jax.random.split(jax.random.key(2), steps),
-    )
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), batch))
-    program = jax.jit(lambda state: jax.lax.scan(step, state, inputs)[0])
-    return _repeated(program, state, steps * batch)
-
-
-def training(batch: int, steps: int) -> Measure:
+def training(task: str, batch: int, steps: int) -> Measure:
     """The MAPPO-Lagrangian training loop on the task's own settings, as `pmt train` compiles it."""
-    run = setup(load_config("ant_2x4", method="mappo_l", num_envs=batch))
+    run = setup(load_config(task, method="mappo_l", num_envs=batch, physics="mujoco"))
     updates = max(1, steps // run.config.rollout_length)
 
     def chunk(hyper, state):
@@ -120,71 +170,73 @@ def training(batch: int, steps: int) -> Measure:
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
     state = jax.jit(jax.vmap(functools.partial(learner.init, run), (None, 0)))(run.hyper, keys)
     program = jax.jit(jax.vmap(chunk, (None, 0)), donate_argnums=1)
-    return _repeated(functools.partial(program, run.hyper), state, updates * run.config.batch_size)
-
-
-def _repeated(program: Callable[[Any], Any], state: Any, steps: int) -> Measure:
-    """Steps/s of a compiled program that goes on from where it stopped."""
-    carry = [jax.block_until_ready(program(state))]
-
-    def measure() -> float:
-        begin = time.perf_counter()
-        carry[0] = jax.block_until_ready(program(carry[0]))
-        return steps / (time.perf_counter() - begin)
-
-    return measure
+    return repeated(functools.partial(program, run.hyper), state, updates * run.config.batch_size)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Measuring side by side
 
 
-def compare(batches: list[int], engines: list[str], repeats: int, seconds: float, patience: float) -> list[Any]:
+def rates(task: str, quick: bool, repeats: int, seconds: float, patience: float) -> Rows:
     """One row for each thing measured: median steps/s, ratios to the plain loops, what other work took meanwhile."""
-    threads, count = usable_cpus(), int(ROUGH["mujoco"] * seconds)
-    measures: dict[str, Measure] = {
-        "plain loop": lambda: plain_loop(count),
-        "plain loops at once": lambda: at_once(plain_loop, threads, count),
-    }
-    for engine in [*engines, "training"]:
+    subject, threads = SUBJECTS[task], usable_cpus()
+    engines, batches = (subject.engines[:1], subject.batches[:2]) if quick else (subject.engines, subject.batches)
+    loop = functools.partial(plain_loop, subject.plain())
+    count = int(engines[0].rough * seconds)
+    measures: list[tuple[Head, Measure]] = [
+        ({"what": "plain loop"}, lambda: loop(count)),
+        ({"what": "plain loops at once"}, lambda: at_once(loop, threads, count)),
+    ]
+    for name, options, rough in engines:
         for batch in batches:
-            steps = max(2, int(ROUGH[engine] * (1 if engine.startswith("mjx") else threads) * seconds / batch))
-            physics, _, solver = engine.partition(" ")
-            make = training if engine == "training" else functools.partial(env_alone, physics=physics)
-            options = {"solver": solver} if solver else {}
-            measures[f"{engine} B={batch}"] = make(batch, steps, **options)
-            print(f"compiled {engine} B={batch}", file=sys.stderr)
-    return interleaved(measures, repeats, patience)
+            steps = max(2, int(rough * (threads if name == "mujoco" else 1) * seconds / batch))
+            measure, _ = env_alone(batch, steps, task, physics=name, **options)
+            measures.append(({"what": "environment", "physics": name, **options, "batch": batch}, measure))
+    if subject.training is not None:
+        for batch in batches:
+            measure = training(task, batch, max(2, int(subject.training * threads * seconds / batch)))
+            measures.append(({"what": "training", "physics": "mujoco", "method": "mappo_l", "batch": batch}, measure))
+    return [{"task": task, **row} for row in interleaved(measures, repeats, patience)]
 
 
-def interleaved(measures: dict[str, Measure], repeats: int, patience: float) -> list[Any]:
-    """A row for each of `measures`, among them "plain loop" and "plain loops at once", which the others relate to."""
+def interleaved(measures: list[tuple[Head, Measure]], repeats: int, patience: float) -> Rows:
+    """A row for each of `measures`; the first two are the plain loop and plain loops at once, which all relate to."""
     threads = usable_cpus()
-    found: dict[str, list[float]] = {name: [] for name in measures}
-    others: dict[str, list[float]] = {name: [] for name in measures}
+    found = [_Found() for _ in measures]
     for _ in range(repeats):
-        for name, measure in measures.items():
+        for (_, measure), each in zip(measures, found, strict=True):
             _await_quiet(patience)
             watch = _Watch()
-            found[name].append(measure())
-            others[name].append(watch.others())
-    plain, at_once = statistics.median(found["plain loop"]), statistics.median(found["plain loops at once"])
+            each.rates.append(measure())
+            each.others.append(watch.others())
+            each.of_cpu.append(each.rates[-1] / watch.own())
+    plain, at_once = (statistics.median(each.rates) for each in found[:2])
     return [
         {
-            "name": name,
-            "steps_per_s": round(statistics.median(values)),
-            "low": round(min(values)),
-            "high": round(max(values)),
-            "of_plain_x_threads": round(statistics.median(values) / (threads * plain), 3),
-            "of_plain_at_once": round(statistics.median(values) / at_once, 3),
-            "other_work_cpus": round(statistics.median(others[name]), 2),
+            **head,
+            "steps_per_second": round(middle := statistics.median(each.rates)),
+            "lowest": round(min(each.rates)),
+            "highest": round(max(each.rates)),
+            "steps_per_cpu_second": round(statistics.median(each.of_cpu)),
+            "of_plain_x_threads": round(middle / (threads * plain), 3),
+            "of_plain_at_once": round(middle / at_once, 3),
+            "other_work_cpus": round(statistics.median(each.others), 2),
         }
-        for name, values in found.items()
+        for (head, _), each in zip(measures, found, strict=True)
     ]
 
 
+@dataclasses.dataclass
+class _Found:
+    """Of one thing measured: steps/s, steps per CPU-second, CPUs that other work took; one of each per round."""
+
+    rates: list[float] = dataclasses.field(default_factory=list)
+    of_cpu: list[float] = dataclasses.field(default_factory=list)
+    others: list[float] = dataclasses.field(default_factory=list)
+
+
 class _Watch:
-    """How many CPUs other processes kept busy since it was made."""
+    """How many CPUs this process and others kept busy since it was made."""
 
     def __init__(self) -> None:
         self._begin = self._now()
@@ -195,9 +247,16 @@ class _Watch:
         busy = sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
         return time.perf_counter(), busy, time.process_time()
 
+    def _since(self) -> tuple[float, ...]:
+        return tuple(now - then for now, then in zip(self._now(), self._begin, strict=True))
+
     def others(self) -> float:
-        wall, busy, own = (now - then for now, then in zip(self._now(), self._begin, strict=True))
+        wall, busy, own = self._since()
         return max(0.0, busy - own) / wall
+
+    def own(self) -> float:
+        wall, _, own = self._since()
+        return own / wall
 
 
 def _await_quiet(patience: float) -> None:
@@ -211,28 +270,43 @@ def _await_quiet(patience: float) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Starting and memory
+# Compiling, starting and memory
 
 
-def starts(patience: float) -> dict[str, Any]:
-    """Seconds of `pmt train ant_2x4 --method mappo_l` with an empty compile cache, then with what that left in it."""
+def step_compiled(task: str, engine: Engine, batch: int) -> Head:
+    """CPU-seconds to trace and to compile one step of `batch` environments."""
+    env = envs.make(task, physics=engine.name, **engine.options)
+    shape = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), batch))
+    action = jax.ShapeDtypeStruct((batch, *env.spec.action_mask.shape), jnp.float32)
+    begin = time.process_time()
+    lowered = jax.jit(jax.vmap(env.step)).lower(shape, action)
+    traced = time.process_time()
+    lowered.compile()
+    took = {"trace_seconds": round(traced - begin, 1), "compile_seconds": round(time.process_time() - traced, 1)}
+    return {"task": task, "what": "step compiled", "physics": engine.name, **engine.options, "batch": batch, **took}
+
+
+def starts(task: str, patience: float) -> Rows:
+    """`pmt train` with an empty compile cache, with what that left in it, and of 256 environments x 64 steps."""
+    big = ("--num-envs", "256", "--rollout-length", "64", "--steps", str(2 * 256 * 64))
+    runs = (("first start", "one", ()), ("second start", "one", ()), ("256 x 64", "other", big))
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        rows = []
-        for name in ("cold", "cached"):
+        for what, cache, flags in runs:
             _await_quiet(patience)
-            rows.append(_start(pathlib.Path(folder), name))
-    return dict(zip(("first", "second"), rows, strict=True))
+            rows.append({"task": task, "what": what, **_start(pathlib.Path(folder), task, cache, *flags)})
+    return rows
 
 
-def _start(folder: pathlib.Path, name: str, *flags: str) -> dict[str, Any]:
-    """One update of training in a process of its own."""
-    out = folder / name
-    command = [sys.executable, "-m", "pmt_jax.cli", "train", "ant_2x4", "--method", "mappo_l", "--log-interval", "1"]
+def _start(folder: pathlib.Path, task: str, cache: str, *flags: str) -> Head:
+    """Trains in a process of its own, 4,096 steps unless `flags` say otherwise, with its compile cache so named."""
+    out = pathlib.Path(tempfile.mkdtemp(dir=folder))
+    command = [sys.executable, "-m", "pmt_jax.cli", "train", task, "--method", "mappo_l", "--log-interval", "1"]
     command += ["--steps", "4096", "--out", str(out), *flags]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / cache), "PYTHONPATH": os.pathsep.join(sys.path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     watch, begin = _Watch(), time.perf_counter()
-    with open(folder / f"{name}.log", "w+") as log:
+    with open(folder / f"{out.name}.log", "w+") as log:
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
         metrics, first = out / "metrics.jsonl", None
         while (done := os.wait4(process.pid, os.WNOHANG))[0] == 0:
@@ -247,93 +321,35 @@ def _start(folder: pathlib.Path, name: str, *flags: str) -> dict[str, Any]:
     cpu = usage.ru_utime + usage.ru_stime
     wall = time.perf_counter() - begin
     return {
-        "to_first_update_s": round(first or wall, 2),
-        "compiled_in_s": float(compiled[1]),
         "cache": compiled[2],
-        "cpu_s": round(cpu, 2),
+        "compile_seconds": float(compiled[1]),
+        "first_update_seconds": round(first or wall, 2),
+        "cpu_seconds": round(cpu, 2),
+        "memory_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),
         "other_work_cpus": round(max(0.0, watch.others() - cpu / wall), 2),
-        "peak_rss_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),
     }
-
-
-def memory() -> dict[str, Any]:
-    """Peak memory of training 256 environments x 64 steps for two updates, compiling included."""
-    with tempfile.TemporaryDirectory() as folder:
-        return _start(
-            pathlib.Path(folder), "big", "--num-envs", "256", "--rollout-length", "64", "--steps", str(2 * 256 * 64)
-        )
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The report
-
-
-def machine() -> dict[str, Any]:
-    cpu = platform.processor()
-    if (info := pathlib.Path("/proc/cpuinfo")).exists():
-        cpu = next((x.split(":")[1].strip() for x in info.read_text().splitlines() if x.startswith("model name")), cpu)
-    memory = psutil.virtual_memory().total / 1e9
-    return {"cpu": cpu, "threads": usable_cpus(), "memory_gb": round(memory), "system": platform.platform()}
-
-
-def conditions(args: argparse.Namespace) -> dict[str, Any]:
-    """Where, when and with what a benchmark runs: the beginning of its report."""
-    return {
-        "machine": machine(),
-        "versions": {"python": platform.python_version(), "jax": jax.__version__, "mujoco": mujoco.__version__},
-        "commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain", "-uno") else ""),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "load_average": {"begin": os.getloadavg()},
-        "settings": {key: value for key, value in vars(args).items() if key != "out"},
-    }
-
-
-def _git(*words: str) -> str:
-    here = pathlib.Path(__file__).parent
-    return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=False).stdout.strip()
-
-
-def verdict(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Each target beside what was found."""
-    found = [
-        (f"{row['name']}: of plain loop x threads", TARGETS[row["name"].split()[0]], row["of_plain_x_threads"], True)
-        for row in report["rates"]
-        if row["name"].split()[0] in TARGETS
-    ]
-    if "starts" in report:
-        first, second = report["starts"]["first"], report["starts"]["second"]
-        found.append(("training program compiled, s", TARGETS["compile_s"], first["compiled_in_s"], False))
-        seconds = second["to_first_update_s"]
-        found.append(("second start to the first update, s", TARGETS["second_start_s"], seconds, False))
-    if "memory" in report:
-        found.append(("memory, 256 envs x 64 steps, GB", TARGETS["rss_gb"], report["memory"]["peak_rss_gb"], False))
-    return [
-        {"what": what, "target": target, "found": value, "met": value >= target if more else value <= target}
-        for what, target, value, more in found
-    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the C engine and training at 16 and 64, no starts")
-    parser.add_argument("--out", type=pathlib.Path, help="a JSON file for the report")
+    parser.add_argument("task", choices=SUBJECTS)
+    parser.add_argument("--quick", action="store_true", help="one engine, two batches, no starts")
+    parser.add_argument("--out", type=pathlib.Path, help="a JSON file for the rows")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=1.5, help="roughly, of one measurement")
     parser.add_argument("--patience", type=float, default=20.0, help="s to wait for other work before a measurement")
     args = parser.parse_args()
-    batches = [16, 64] if args.quick else [16, 64, 256]
-    engines = ["mujoco"] if args.quick else ["mujoco", "mjx converged", "mjx fast"]
-    report = conditions(args)
-    if not args.quick:  # first, while this process holds no programs
-        report["starts"], report["memory"] = starts(6 * args.patience), memory()
-    report["rates"] = compare(batches, engines, args.repeats, args.seconds, args.patience)
-    report["load_average"]["end"] = os.getloadavg()
-    report["targets"] = verdict(report)
-    for row in [*report["rates"], *report["targets"]]:
+    jax.config.update("jax_enable_compilation_cache", False)
+    subject, rows = SUBJECTS[args.task], []
+    if not args.quick:  # starts first, while this process holds no programs
+        rows += starts(args.task, 6 * args.patience) if subject.training else []
+        rows += [step_compiled(args.task, engine, 64) for engine in subject.engines]
+    rows += rates(args.task, args.quick, args.repeats, args.seconds, args.patience)
+    for row in rows:
         print(json.dumps(row))
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps(report, indent=2) + "\n")
+        settings = {name: getattr(args, name) for name in ("repeats", "seconds", "patience")}
+        records.write(args.out, rows, settings=settings)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from pmt_jax import METHODS, load_config, make_train
 from pmt_jax.statistics import bootstrap_interval
 
 from . import records
+from .tables import markdown
 
 SEEDS = 5
 LAST = 15
@@ -57,12 +58,16 @@ def interval(values: list[float], digits: int = 2) -> str:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = ["| task | method | episode cost | episode reward |", "|---|---|---|---|"]
-    for row in rows:
-        changes = "".join(f", {k} = {v}" for k, v in row["changes"].items())
-        cost, reward = interval(row["episode_cost"]), interval(row["episode_reward"])
-        lines.append(f"| {row['task']} | {row['method']}{changes} | {cost} | {reward} |")
-    return "\n".join(lines)
+    body = [
+        [
+            row["task"],
+            row["method"] + "".join(f", {k} = {v}" for k, v in row["changes"].items()),
+            interval(row["episode_cost"]),
+            interval(row["episode_reward"]),
+        ]
+        for row in rows
+    ]
+    return markdown(("task", "method", "episode cost", "episode reward"), body)
 
 
 def main() -> None:

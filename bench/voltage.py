@@ -19,6 +19,7 @@ from pmt_jax.experiment import evaluate_baseline
 
 from . import records
 from .search import search
+from .tables import markdown
 from .toys import interval
 
 TASK, SEEDS, EPISODES = "voltage_33", 5, 64
@@ -49,15 +50,19 @@ def given(policy: str) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = ["| policy | steps a seed | CR | PL, MW | episode reward | episode cost |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        cells = [
-            f"{row[name][0]:.3f}" if len(row[name]) == 1 else interval(row[name], 3)
-            for name in ("CR", "PL", "reward", "cost")
+
+    def cell(values: list[float]) -> str:
+        return f"{values[0]:.3f}" if len(values) == 1 else interval(values, 3)
+
+    body = [
+        [
+            row["policy"],
+            f"{row['steps']:,}" if "steps" in row else "-",
+            *(cell(row[name]) for name in ("CR", "PL", "reward", "cost")),
         ]
-        steps = f"{row['steps']:,}" if "steps" in row else "-"
-        lines.append(f"| {row['policy']} | {steps} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        for row in rows
+    ]
+    return markdown(("policy", "steps a seed", "CR", "PL, MW", "episode reward", "episode cost"), body)
 
 
 def main() -> None:

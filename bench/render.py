@@ -1,0 +1,60 @@
+"""Tables in the documentation, made from bench/results.
+
+A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
+bench/tables.py makes of the results; whatever stood there before is replaced.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import re
+from collections.abc import Callable
+
+from pmt_jax.errors import UsageError
+from pmt_jax.files import replace_text
+from pmt_jax.tasks import did_you_mean
+
+from .compare import RESULTS, Report, load
+from .tables import TABLES
+
+ROOT = pathlib.Path(__file__).parent.parent
+BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
+MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
+
+
+def documents() -> list[pathlib.Path]:
+    """The Markdown files that have blocks."""
+    candidates = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    return [path for path in candidates if MARK.search(path.read_text())]
+
+
+def render(text: str, reports: dict[str, Report]) -> str:
+    """`text` with its blocks made anew.
+
+    Raises:
+      UsageError: a block names no table, or does not end.
+    """
+
+    def block(found: re.Match[str]) -> str:
+        begin, name, _, end = found.groups()
+        if name not in TABLES:
+            raise UsageError(f"unknown table '{name}'{did_you_mean(name, TABLES)}")
+        return f"{begin}{TABLES[name](reports)}\n{end}"
+
+    rendered, blocks = BLOCK.subn(block, text)
+    if 2 * blocks != len(MARK.findall(text)):
+        raise UsageError("a block that begins with <!-- bench: NAME --> does not end with <!-- /bench -->")
+    return rendered
+
+
+def documents_anew(check: bool, say: Callable[[str], None] = print) -> int:
+    """Makes the tables anew or, to `check`, says which are not what the results say; 1 if there are any."""
+    reports, old = load(str(RESULTS)), 0
+    for path in documents():
+        text = path.read_text()
+        if (rendered := render(text, reports)) != text:
+            old += 1
+            say(f"{path.relative_to(ROOT)}: " + ("old; python -m bench render makes it anew" if check else "made anew"))
+            if not check:
+                replace_text(path, rendered)
+    return int(check and old > 0)
