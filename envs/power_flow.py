@@ -513,15 +513,10 @@ def branch_network(
     f, t, z, half, ratio = _branch_arrays(n_bus, branches, name)
     shunts = np.zeros(n_bus, complex) if shunt is None else np.asarray(shunt, complex)
     to_series, y_bus = _admittance(n_bus, f, t, 1 / z, half, ratio, shunts)
-    others = np.setdiff1d(np.arange(n_bus), [slack])
     _check_connected(n_bus, f, t, slack, name)
-    where = others if inject is None else _injection_buses(inject, n_bus, slack)
+    where = np.setdiff1d(np.arange(n_bus), [slack]) if inject is None else _injection_buses(inject, n_bus, slack)
     slack_v = slack_vm * np.exp(1j * slack_va)
-
-    z_all = np.zeros((n_bus, n_bus), complex)  # with zeros for the slack, whose voltage no current moves
-    z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
-    v_0 = -z_all @ y_bus[:, slack] * slack_v
-    v_0[slack] = slack_v
+    z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v)
     series = to_series @ z_all[:, where]
     series_0 = to_series @ v_0
     feed, feed_0 = y_bus[slack] @ z_all[:, where], y_bus[slack] @ v_0
@@ -549,6 +544,16 @@ def branch_network(
         series_only=bool(plain),
         name=name,
     )
+
+
+def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex) -> tuple[np.ndarray, np.ndarray]:
+    """z [n, n] and v_0 [n], p.u., with V = z I + v_0; the slack's row and column of z are 0: no current moves it."""
+    others = np.setdiff1d(np.arange(len(y_bus)), [slack])
+    z_all = np.zeros(y_bus.shape, complex)
+    z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
+    v_0 = -z_all @ y_bus[:, slack] * slack_v
+    v_0[slack] = slack_v
+    return z_all, v_0
 
 
 def _branch_arrays(n_bus: int, branches: Sequence[Branch], name: str) -> tuple[np.ndarray, ...]:
