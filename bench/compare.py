@@ -19,9 +19,9 @@ from pmt_jax.errors import UsageError
 Report = dict[str, Any]
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-LESS, SHARES = ("_seconds", "_gb", "_mb"), ("ratio", "of_plain_x_threads", "gpu_busy")
+LESS, SHARES = ("_seconds", "_gb", "_mb"), ("ratio", "of_plain_x_threads", "gpu_busy", "efficiency")
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
-SUBJECT = ("task", "case", "policy", "what", "method", "changes", "physics", "solver", "precision")
+SUBJECT = ("task", "case", "policy", "what", "method", "scaling", "changes", "physics", "solver", "precision")
 SIZES = ("devices", "seeds", "num_envs", "rollout_length", "batch", "steps")
 WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 

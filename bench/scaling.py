@@ -1,8 +1,7 @@
 """Weak and strong scaling of the whole training loop over 1, 2, 4 ... of the devices that JAX sees.
 
-    python -m bench.scaling --out bench/results/scaling.json
+    python -m bench all --only scaling
     XLA_FLAGS=--xla_force_host_platform_device_count=2 JAX_PLATFORMS=cpu python -m bench.scaling --tasks switch
-    python -m bench.scaling --from bench/results/scaling.json               prints the table
 
 | scaling | D devices train | each device has |
 |---|---|---|
@@ -35,7 +34,7 @@ from pmt_jax.folder import MATMUL_PRECISION
 from pmt_jax.run import setup
 
 from . import records, turns
-from .tables import markdown
+from .tables import scaling as table
 
 GPU_SIZES = {"switch": (4096, 25), "voltage_33": (4096, 60), "ant_2x4": (4096, 8)}  # B, steps between updates
 CPU_SIZES = {"switch": (64, 25), "voltage_33": (32, 60), "ant_2x4": (32, 64)}
@@ -103,23 +102,6 @@ def _row(contestant: Contestant, alone: float) -> dict[str, Any]:
     }
 
 
-def table(rows: records.Rows) -> str:
-    """Markdown."""
-    head = ("task", "scaling", "devices", "seeds x environments x steps", "environment steps/s", "efficiency")
-    body = [
-        [
-            row["task"],
-            row["scaling"],
-            str(row["devices"]),
-            f"{row['seeds']} x {row['num_envs']:,} x {row['rollout_length']}",
-            f"{row['steps_per_second']:,}",
-            f"{row['efficiency']:.2f}",
-        ]
-        for row in rows
-    ]
-    return markdown(head, body)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", default=",".join(GPU_SIZES), help="with commas")
@@ -128,11 +110,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=4, help="in a chunk")
     parser.add_argument("--repeats", type=int, default=7, help="chunks of each program")
     parser.add_argument("--out", type=pathlib.Path, help="a JSON file for the rows")
-    parser.add_argument("--from", dest="source", type=pathlib.Path)
     arguments = parser.parse_args()
-    if arguments.source:
-        print(table(records.read(arguments.source)))
-        return
     processes.make_room()
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     sizes = CPU_SIZES if jax.devices()[0].platform == "cpu" else GPU_SIZES
@@ -141,7 +119,7 @@ def main() -> None:
     for task in arguments.tasks.split(","):
         num_envs, length = sizes[task]
         rows += measure(task, (arguments.num_envs or num_envs, length), counts, arguments)
-        print(table(rows), flush=True)
+        print(table({"rows": rows}), flush=True)
         if arguments.out:
             records.write(arguments.out, rows)
 

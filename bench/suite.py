@@ -19,7 +19,7 @@ from . import compare
 
 Say = Callable[[str], None]
 
-PROBE = "import jax; print(jax.devices()[0].device_kind)"
+PROBE = "import jax; print(jax.device_count(), jax.devices()[0].device_kind)"
 
 
 class Bench(NamedTuple):
@@ -28,14 +28,14 @@ class Bench(NamedTuple):
     Attributes:
       what: what it measures, with units.
       command: the module and its arguments; quick: those that a smoke has besides.
-      on: `cpu`, or `gpu` for one that is skipped where there is none unless it is asked for by name; the results of the
-        latter are called after the device too.
+      on: `cpu`, or `gpu` or `gpus` for one that is skipped where there is none, or only one, unless it is asked for by
+        name; the results of the latter two are called after the device too.
     """
 
     what: str
     command: str
     quick: str
-    on: Literal["cpu", "gpu"] = "cpu"
+    on: Literal["cpu", "gpu", "gpus"] = "cpu"
 
 
 _SHORT = "--quick --repeats 2 --seconds 0.3 --patience 0"
@@ -67,6 +67,12 @@ BENCHES = {
         "bench.loop",
         "--cases ant_2x4:mappo_l:1x64x8,ant_2x4:mappo_l:2x64x8 --updates 2 --repeats 1",
         on="gpu",
+    ),
+    "scaling": Bench(
+        "GPUs: environment steps/s of the whole training loop over 1, 2, 4 ... devices, and the efficiency",
+        "bench.scaling",
+        "--tasks switch --num-envs 8 --updates 1 --repeats 1",
+        on="gpus",
     ),
 }
 
@@ -104,13 +110,13 @@ def run_all(only: str | None, out: pathlib.Path | None, quick: bool, say: Say) -
     names, out = chosen(only), folder(out, quick)
     out.mkdir(parents=True, exist_ok=True)
     committed = _committed(say)
-    device = _device() if any(BENCHES[name].on == "gpu" for name in names) else "cpu"
+    count, device = _devices() if any(BENCHES[name].on != "cpu" for name in names) else (0, "cpu")
     done, failed, stopped = [], [], False
     for number, name in enumerate(names, 1):
         bench = BENCHES[name]
         result = name if bench.on == "cpu" else f"{name}_{slug(device)}"
-        if bench.on == "gpu" and device == "cpu" and only is None:
-            say(f"[{number}/{len(names)}] {name}: skipped, as there is no GPU here")
+        if only is None and (missing := _missing(bench, count, device)):
+            say(f"[{number}/{len(names)}] {name}: skipped, as there is {missing} here")
             continue
         say(f"[{number}/{len(names)}] {name}: {bench.what}{'' if quick else _usually(committed.get(result))}")
         try:
@@ -162,9 +168,17 @@ def _committed(say: Say) -> dict[str, compare.Report]:
         return {}
 
 
-def _device() -> str:
-    """The kind of JAX's first device, asked for in another process, since whoever asks takes its memory."""
+def _missing(bench: Bench, count: int, device: str) -> str | None:
+    """What `count` devices of this kind lack for a bench."""
+    if bench.on == "cpu":
+        return None
+    return "no GPU" if device == "cpu" else "one GPU only" if bench.on == "gpus" and count == 1 else None
+
+
+def _devices() -> tuple[int, str]:
+    """How many devices JAX sees and their kind, asked in another process, since whoever asks takes their memory."""
     asked = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=False)
     if asked.returncode:
         raise UsageError(f"JAX does not start here: {asked.stderr.strip().splitlines()[-1]}")
-    return asked.stdout.strip().splitlines()[-1]
+    count, device = asked.stdout.strip().splitlines()[-1].split(maxsplit=1)
+    return int(count), device

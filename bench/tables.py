@@ -203,6 +203,23 @@ def loop(report: Report) -> str:
     return markdown((*head, "x one seed", "compile, s", "memory, GB", "GPU busy"), body)
 
 
+def scaling(report: Report) -> str:
+    """Weak and strong scaling of the training loop over devices."""
+    head = ("task", "scaling", "devices", "seeds x environments x steps", "environment steps/s", "efficiency")
+    body = [
+        [
+            row["task"],
+            row["scaling"],
+            str(row["devices"]),
+            f"{row['seeds']} x {row['num_envs']:,} x {row['rollout_length']}",
+            f"{row['steps_per_second']:,}",
+            f"{row['efficiency']:.2f}",
+        ]
+        for row in report["rows"]
+    ]
+    return markdown(head, body)
+
+
 def with_one_seed(rows: list[Row]) -> list[Row]:
     """`rows`, with `times_one_seed`, the ratio of update seconds, where another row differs in having one seed."""
 
@@ -253,6 +270,7 @@ TARGETS = (
     Target("loop_h200", FIVE_SEEDS, "steps_per_second", 200_000),
     Target("loop_h200", FIVE_SEEDS, "gpu_busy", 0.8),
     Target("loop_h200", FIVE_SEEDS, "times_one_seed", 1.5, more=False),
+    Target("scaling_h200", {"task": "ant_2x4", "scaling": "weak, environments", "devices": 4}, "efficiency", 0.9),
 )
 
 
@@ -307,6 +325,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "checkpoint": checkpoint,
     "engines": functools.partial(per_device, bench="engines", table=engines),
     "loop": functools.partial(per_device, bench="loop", table=loop),
+    "scaling": functools.partial(per_device, bench="scaling", table=scaling),
     "hub": hub,
     "targets_cpu": functools.partial(targets, gpu=False),
     "targets_h200": functools.partial(targets, gpu=True),

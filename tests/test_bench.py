@@ -60,6 +60,26 @@ def test_ctrl_c_keeps_what_is_finished(fakes):
 
 
 @pytest.mark.parametrize(
+    ("count", "device", "skipped"),
+    [(1, "cpu", ["no GPU", "no GPU"]), (1, "NVIDIA H200", ["one GPU only"]), (2, "NVIDIA H200", [])],
+)
+def test_what_a_machine_lacks_is_skipped(
+    fakes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int, device: str, skipped: list
+):
+    out = fakes("first", "second", "third")
+    for name, on in (("second", "gpu"), ("third", "gpus")):
+        monkeypatch.setitem(suite.BENCHES, name, suite.BENCHES[name]._replace(on=on))
+    monkeypatch.setattr(suite, "_devices", lambda: (count, device))
+    assert main(["all", "--out", str(out)]) == 0
+    names = ["first", "second_h200", "third_h200"][: 3 - len(skipped)]
+    assert sorted(path.stem for path in out.iterdir()) == names
+    said = capsys.readouterr().out
+    assert [line.split("there is ")[1] for line in said.splitlines() if "skipped" in line] == [
+        f"{x} here" for x in skipped
+    ]
+
+
+@pytest.mark.parametrize(
     ("argv", "said"),
     [
         (["al"], "unknown command 'al'; did you mean 'all'?"),
