@@ -83,6 +83,7 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
     """One update: act, appraise, estimate advantages, fit the critics, cope."""
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
+    hyper = _by_now(run, hyper, state.update)
 
     # 1 Information source: the team acts.
     state, batch = _act(run, state, tagged[Tag.ACTION])
@@ -133,6 +134,13 @@ def train_step(run: Run, hyper: Hyper, state: LearnerState) -> tuple[LearnerStat
         **{f"fear/{k}": x for k, x in fear_metrics.items()},
         **{f"regret/{k}": x for k, x in regret_metrics.items()},
     }
+
+
+def _by_now(run: Run, hyper: Hyper, update: jax.Array) -> Hyper:
+    """`hyper` with the step sizes that are left after so many updates."""
+    left = jnp.exp2(-(update * run.config.batch_size / hyper.lr_half_life))
+    rates = ("actor_lr", "critic_lr", "appraisal_lr")
+    return dataclasses.replace(hyper, **{name: getattr(hyper, name) * left for name in rates})
 
 
 def _act(run: Run, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Batch]:

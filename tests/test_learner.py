@@ -181,6 +181,21 @@ def test_hyper_parameters_are_traced_and_can_be_swept():
     np.testing.assert_allclose(state.multiplier[0], 0.78)
 
 
+def test_step_sizes_of_all_networks_halve_in_their_half_life():
+    run = setup(load_config("lane", method="mixed", **SMALL))
+    rates = ("actor_lr", "critic_lr", "appraisal_lr")
+    halved = dataclasses.replace(run.hyper, **{name: getattr(run.hyper, name) / 2 for name in rates})
+    falling = dataclasses.replace(run.hyper, lr_half_life=jnp.float32(run.config.batch_size))
+    step = jax.jit(lambda hyper, state: learner.train_step(run, hyper, state)[0])
+    start = learner.init(run, run.hyper, jax.random.key(0))
+    first = step(falling, start)
+    chex.assert_trees_all_equal(first, step(run.hyper, start))
+    second = step(falling, first)
+    chex.assert_trees_all_equal(second, step(halved, first))
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(second.actor, step(run.hyper, first).actor)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # More costs than one
 
