@@ -197,9 +197,16 @@ def _add_sweep(commands: Any) -> None:
     )
     sweep.add_argument("--out", type=pathlib.Path, required=True, help="the folder that gets a run folder per point")
     sweep.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_jobs(sweep)
     _add_devices(sweep)
     _add_settings(sweep)
     sweep.set_defaults(run=_sweep)
+
+
+def _add_jobs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--jobs", default="1", metavar="N", help="programs that train at a time, for a GPU that one does not fill"
+    )
 
 
 def _add_table(commands: Any) -> None:
@@ -232,6 +239,7 @@ def _add_reproduce(commands: Any) -> None:
     )
     reproduce.add_argument("--out", type=pathlib.Path, help="the folder of its runs (default: runs/reproduce-BUDGET)")
     reproduce.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
+    _add_jobs(reproduce)
     _add_devices(reproduce)
     _add_format(reproduce)
     reproduce.set_defaults(run=_reproduce)
@@ -364,21 +372,26 @@ def _eval(arguments: argparse.Namespace) -> int:
 def _sweep(arguments: argparse.Namespace) -> int:
     vary = dict(_values(word) for word in arguments.vary)
     count = _optional("--devices", arguments.devices, 1)
-    _alone("pmt sweep")
+    at_once = _alone("pmt sweep", arguments.jobs)
     from . import sweep
 
     points = sweep.grid(arguments.source, vary, arguments.preset, **_given(arguments))
-    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say, count=count)
+    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say, count=count, at_once=at_once)
 
 
-def _alone(command: str) -> None:
-    """Refuses to run once in each of several processes, which would write into the same folders."""
+def _alone(command: str, jobs: str) -> int:
+    """Refuses to run once in each of several processes, which would write into the same folders; the number of jobs."""
+    at_once = _whole("--jobs", jobs, least=1)
     _quiet_xla()
     from . import processes
+    from .jobs import share_memory
 
     processes.make_room()
+    if at_once > 1:
+        share_memory()
     if processes.in_step():
         raise UsageError(f"{command} runs in one process; start it without srun, or with srun --ntasks=1")
+    return at_once
 
 
 def _values(word: str) -> tuple[str, list[str]]:
@@ -408,12 +421,12 @@ def _table(arguments: argparse.Namespace) -> int:
 
 def _reproduce(arguments: argparse.Namespace) -> int:
     count = _optional("--devices", arguments.devices, 1)
-    _alone("pmt reproduce")
+    at_once = _alone("pmt reproduce", arguments.jobs)
     from . import sweep
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
     cache = not arguments.no_cache
-    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache, _say, count)
+    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache, _say, count, at_once)
 
 
 def _whole(flag: str, text: str, least: int) -> int:

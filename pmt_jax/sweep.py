@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from . import experiment, table
+from . import experiment, jobs, table
 from .checkpoint import Checkpoints
 from .config import HYPER_FIELDS, Config, differences, load_config, to_toml
 from .errors import UsageError
@@ -64,9 +64,16 @@ def _word(value: str) -> str:
         return re.sub(r"[^\w.=,+-]", "-", value)
 
 
-def sweep(points: Points, out: pathlib.Path, cache: bool = True, say: Say = print, count: int | None = None) -> int:
+def sweep(
+    points: Points,
+    out: pathlib.Path,
+    cache: bool = True,
+    say: Say = print,
+    count: int | None = None,
+    at_once: int = 1,
+) -> int:
     """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
-    code = train_points(points, out, cache, say, count)
+    code = train_points(points, out, cache, say, count, at_once)
     if code == 0:
         say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
         say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
@@ -81,12 +88,13 @@ def reproduce(
     cache: bool = True,
     say: Say = print,
     count: int | None = None,
+    at_once: int = 1,
 ) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
 
     Args:
       name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
-      count: of devices, as for `experiment.train`.
+      count: of devices, as for `experiment.train`; at_once: programs that train at a time.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
@@ -102,10 +110,10 @@ def reproduce(
     plans = {task: _plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
     for points in plans.values():
         setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
-    for task, points in plans.items():
-        code = train_points(points, out / task, cache, say, count)
-        if code:
-            return code
+    programs = [program for task, points in plans.items() for program in _programs(points, out / task, say)]
+    code = _train(programs, cache, say, count, at_once)
+    if code:
+        return code
     rows = table.rows([out / task / point for task, points in plans.items() for point in points])
     say(f"\n{wanted['title']}, budget '{budget}'\n")
     say(table.render(rows, form, wanted["baseline"]))
@@ -119,11 +127,19 @@ def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
 
 
 def train_points(
-    points: Points, out: pathlib.Path, cache: bool = True, say: Say = print, count: int | None = None
+    points: Points,
+    out: pathlib.Path,
+    cache: bool = True,
+    say: Say = print,
+    count: int | None = None,
+    at_once: int = 1,
 ) -> int:
     """Trains what is missing of `points`, each into its own folder under `out`.
 
     Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
+
+    Args:
+      count: of devices, as for `experiment.train`; at_once: programs that train at a time, each in its own process.
 
     Returns:
       The exit code of `experiment.train`: 0 when all points are finished.
@@ -131,18 +147,53 @@ def train_points(
     Raises:
       UsageError: `out` holds a point of the same name with other settings.
     """
+    return _train(_programs(points, out, say), cache, say, count, at_once)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Program:
+    """Points that train together: their hidden folder, and the folder that gets theirs."""
+
+    folder: pathlib.Path
+    points: Points
+    out: pathlib.Path
+
+
+def _programs(points: Points, out: pathlib.Path, say: Say) -> list[_Program]:
+    """What is missing of `points`."""
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
-    groups = list(_groups(points, missing, out))
-    for number, (folder, group) in enumerate(groups, 1):
-        first = next(iter(group.values()))
-        say(f"program {number} of {len(groups)}: {len(group)} point(s) x {first.seeds} seed(s) side by side")
-        code = _train_group(folder, group, cache, say, count)
+    return [_Program(folder, group, out) for folder, group in _groups(points, missing, out)]
+
+
+def _train(programs: Sequence[_Program], cache: bool, say: Say, count: int | None, at_once: int) -> int:
+    """Trains programs one after the other, or several at a time in processes of their own."""
+    titles = []
+    for number, program in enumerate(programs, 1):
+        first = next(iter(program.points.values()))
+        size = f"{len(program.points)} point(s) x {first.seeds} seed(s) side by side"
+        titles.append(f"program {number} of {len(programs)}: {size}")
+        _write_points(program)
+    if at_once > 1:
+        for title, program in zip(titles, programs, strict=True):
+            say(f"{title}, {program.out.name}: {', '.join(program.points)}")
+        return jobs.run([jobs.command(p.folder, p.out, cache, count) for p in programs], at_once, say)
+    for title, program in zip(titles, programs, strict=True):
+        say(title)
+        code = train_program(program.folder, program.out, cache, say, count)
         if code:
             return code
-        _cut(folder, group, out)
     return 0
+
+
+def _write_points(program: _Program) -> None:
+    try:
+        (program.folder / "points").mkdir(parents=True, exist_ok=True)
+        for name, config in program.points.items():
+            (program.folder / "points" / f"{name}.toml").write_text(to_toml(config))
+    except OSError as error:
+        raise UsageError(f"cannot write into {program.out}: {error.strerror}; choose another --out") from None
 
 
 def _finished(folder: pathlib.Path, config: Config) -> bool:
@@ -160,8 +211,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
     left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
     for folder in begun:
-        files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
-        group = {file.stem: load_config(file) for file in files}
+        group = _points(folder)
         if group and all(repr(points.get(name)) == repr(config) for name, config in group.items()):
             left = {name: config for name, config in left.items() if name not in group}
             yield folder, group
@@ -174,14 +224,15 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say, count: int | None) -> int:
-    """Trains the points of one program side by side, or goes on with it."""
-    try:
-        (folder / "points").mkdir(parents=True, exist_ok=True)
-        for name, config in group.items():
-            (folder / "points" / f"{name}.toml").write_text(to_toml(config))
-    except OSError as error:
-        raise UsageError(f"cannot write into {folder.parent}: {error.strerror}; choose another --out") from None
+def _points(folder: pathlib.Path) -> Points:
+    """The points of a program's hidden folder."""
+    files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
+    return {file.stem: load_config(file) for file in files}
+
+
+def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
+    """Trains the points of a hidden `folder` side by side, or goes on with it; then each gets its folder in `out`."""
+    group = _points(folder)
     configs = list(group.values())
     seeds, run = configs[0].seeds, setup(configs[0])
     settings = [dataclasses.replace(run, config=config).hyper for config in configs]
@@ -190,7 +241,10 @@ def _train_group(folder: pathlib.Path, group: Points, cache: bool, say: Say, cou
     lanes = Lanes(own if len(group) > 1 else settings[0], seed)  # settings that are shared keep the last bits of a run
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
-    return experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes, count=count)
+    code = experiment.train(common, folder / "run", resume=begun, cache=cache, say=say, lanes=lanes, count=count)
+    if code == 0:
+        _cut(folder, group, out)
+    return code
 
 
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:

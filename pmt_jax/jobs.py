@@ -1,0 +1,111 @@
+"""Several programs of a sweep at a time, each in a process of its own: what one leaves idle of a GPU, another uses.
+
+A process trains what `sweep.train_program` trains, says every line through its parent, and ends, saved, with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+import types
+from collections.abc import Iterator, Sequence
+
+from .folder import Say
+
+POLL_SECONDS = 0.1
+
+
+def share_memory() -> None:
+    """Lets processes share a GPU's memory, of which JAX would give the first three quarters; before JAX starts."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+def command(folder: pathlib.Path, out: pathlib.Path, cache: bool, count: int | None) -> list[str]:
+    """What a process runs, see `main`."""
+    return [sys.executable, "-m", __name__, str(folder), str(out), str(int(cache)), str(count or "")]
+
+
+def run(commands: Sequence[Sequence[str]], at_once: int, say: Say) -> int:
+    """Runs `commands`, `at_once` at a time, and says what they print with their number in front, from [1].
+
+    Ctrl-C and SIGTERM reach all that run, which save and end. After one has failed no other is started.
+
+    Returns:
+      0, or the exit code of the first that failed.
+    """
+    waiting = [(number, list(words)) for number, words in enumerate(commands, 1)]
+    running: dict[subprocess.Popen[str], threading.Thread] = {}
+    code = 0
+    with _passing_on(running) as received:
+        while running or (waiting and not code and not received):
+            while waiting and len(running) < at_once and not code and not received:
+                _start(*waiting.pop(0), running, say)
+            for process in [p for p in running if p.poll() is not None]:
+                running.pop(process).join()
+                code = code or process.returncode
+            time.sleep(POLL_SECONDS)
+    return code or (128 + received[0] if received and waiting else 0)
+
+
+def _start(number: int, words: list[str], running: dict[subprocess.Popen[str], threading.Thread], say: Say) -> None:
+    pipe = subprocess.PIPE  # the child's standard input ends with this process, however that ends
+    process = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+
+    def repeat() -> None:
+        assert process.stdout
+        for line in process.stdout:
+            say(f"[{number}] {line.rstrip()}")
+
+    running[process] = threading.Thread(target=repeat, daemon=True)
+    running[process].start()
+
+
+@contextlib.contextmanager
+def _passing_on(running: dict[subprocess.Popen[str], threading.Thread]) -> Iterator[list[int]]:
+    """Yields the list of signals that arrived; each was sent to all processes in `running`."""
+    received: list[int] = []
+
+    def pass_on(number: int, _: types.FrameType | None) -> None:
+        received.append(number)
+        for process in list(running):
+            process.send_signal(number)
+
+    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end_with_parent() -> None:
+    """Standard input ends when whoever started this process is gone, even by kill -9: save and end then."""
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def main() -> int:
+    """The process that trains one program: FOLDER OUT CACHE DEVICES."""
+    from . import cli, sweep
+
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    folder, out, cache, count = sys.argv[1:]
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    def train() -> int:
+        devices = int(count) if count else None
+        return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
+
+    return cli.answer("pmt", train)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""Several programs at a time: their output, their failures, and that they end with whoever started them."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+
+from pmt_jax import checkpoint, experiment, jobs
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def program(text: str) -> list[str]:
+    return [sys.executable, "-c", textwrap.dedent(text)]
+
+
+def until(condition, seconds: float = 60.0) -> None:
+    begin = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begin < seconds, "it never happened"
+        time.sleep(0.05)
+
+
+def test_so_many_at_a_time_and_no_more(tmp_path: pathlib.Path):
+    meeting = program(f"""
+        import pathlib, os, time
+        here = pathlib.Path({str(tmp_path)!r})
+        (here / str(os.getpid())).touch()
+        time.sleep(0.6)
+        print(len(list(here.iterdir())))
+        (here / str(os.getpid())).unlink()
+    """)
+    said: list[str] = []
+    assert jobs.run([meeting] * 5, 2, said.append) == 0
+    assert sorted(line.split()[0] for line in said) == [f"[{i}]" for i in range(1, 6)]
+    assert {line.split()[1] for line in said} == {"1", "2"} and said[0].endswith("2")
+
+
+def test_after_a_failure_no_other_is_started_and_those_that_run_go_on():
+    said: list[str] = []
+    slow = program("import time; time.sleep(2); print('done')")
+    assert jobs.run([program("raise SystemExit(3)"), slow, program("print('never')")], 2, said.append) == 3
+    assert said == ["[2] done"]
+
+
+WAITING = """
+import pathlib, signal, sys, threading, time
+from pmt_jax import jobs
+file = pathlib.Path(sys.argv[1])
+def end(number, _):
+    file.write_text(str(number))
+    sys.exit(128 + number)
+signal.signal(signal.SIGINT, end)
+signal.signal(signal.SIGTERM, end)
+threading.Thread(target=jobs._end_with_parent, daemon=True).start()
+file.write_text("ready")
+while True:
+    time.sleep(0.05)
+"""
+
+
+@pytest.mark.parametrize(
+    ("sent", "heard"),
+    [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGTERM), (signal.SIGKILL, signal.SIGTERM)],
+)
+def test_programs_end_with_the_one_that_started_them(tmp_path: pathlib.Path, sent: int, heard: int):
+    files = [tmp_path / "one", tmp_path / "two"]
+    commands = [[sys.executable, "-c", WAITING, str(file)] for file in files]
+    script = f"import sys; from pmt_jax import jobs; sys.exit(jobs.run({commands!r} + [['never']], 2, print))"
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+    until(lambda: all(file.exists() and file.read_text() == "ready" for file in files))
+    os.kill(parent.pid, sent)
+    assert parent.wait(60) == (-sent if sent == signal.SIGKILL else 128 + sent)
+    until(lambda: [file.read_text() for file in files] == [str(int(heard))] * 2)
+
+
+def test_a_sweep_of_two_programs_at_a_time(tmp_path: pathlib.Path, cli):
+    tiny = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--minibatches", 1, "--epochs", 1)
+    tiny += ("--method", "happo", "--steps", 400, "--no-cache", "--out")
+    sizes = ("lane", "--set", "hidden=[8],[12]", *tiny)
+    code, out, _ = cli("sweep", *sizes, tmp_path / "both", "--jobs", 2)
+    assert code == 0 and sorted(p.name for p in (tmp_path / "both").iterdir()) == ["hidden=12", "hidden=8"]
+    assert all(f"[{i}] pmt: happo on lane" in out and f"[{i}] steps 200" in out for i in (1, 2))
+    assert "best first" in out.split("[2] done")[-1]
+    assert cli("train", "lane", "--hidden", 8, *tiny, tmp_path / "alone")[0] == 0
+    both, alone = (checkpoint.pack(experiment.load_run(tmp_path / x)[1]) for x in ("both/hidden=8", "alone"))
+    assert all((both[name] == alone[name]).all() for name in alone)
+    code, out, _ = cli("sweep", *sizes, tmp_path / "both", "--jobs", 2)
+    assert code == 0 and "2 of 2 points are finished already" in out and "compiling" not in out
+    code, _, err = cli("sweep", *sizes, tmp_path / "both", "--jobs", 0)
+    assert code == 2 and "--jobs" in err
