@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .config import Config
 from .errors import UsageError, optional
 from .files import read_rows, writing
 
@@ -35,7 +36,8 @@ EMOTIONS = {
     "regret/weight_std": "regret: spread of the weights",
 }
 COLOURS = ("#2f7fb5", "#e0861a", "#2f9e77", "#c8503f", "#8d6bb8", "#9a7b4f", "#d264a8", "#7f8a91")
-SEEDS_AND_LENGTH = ("seed", "seeds", "steps", "num_updates")  # settings in which repetitions of a run may differ
+# Settings in which repetitions of a run may differ.
+SEEDS_AND_LENGTH = ("seed", "seeds", "steps", "num_updates", "log_interval", "eval_interval", "eval_episodes")
 IDENTITY = {"step", "seed", "task", "method", "cost_limit"}  # what every row of a run says of itself
 ENDINGS = (".png", ".svg", ".pdf")
 _INK = "#808182"  # stands for the reader's own text colour in pictures inside pages
@@ -172,12 +174,17 @@ def _at_steps(run: Curves, name: str, steps: np.ndarray) -> np.ndarray:
 
 def labels(runs: Sequence[Curves]) -> list[str]:
     """What tells each run from the others of its task: the method, and settings that others of it have otherwise."""
+
+    def value(run: Curves, name: str) -> str:  # a run of before a setting came to be has its default
+        x = run.settings.get(name, getattr(Config, name, "default"))
+        return f"{x:g}" if isinstance(x, float) else str(x)
+
     result = []
     for run in runs:
         alike = [other for other in runs if (other.task, other.method) == (run.task, run.method)]
         names = {name for other in alike for name in other.settings} - set(SEEDS_AND_LENGTH)
-        varied = [name for name in sorted(names) if len({repr(other.settings.get(name)) for other in alike}) > 1]
-        words = [f"{name} = {run.settings.get(name, 'default')}" for name in varied]
+        varied = [name for name in sorted(names) if len({value(other, name) for other in alike}) > 1]
+        words = [f"{name} = {value(run, name)}" for name in varied]
         if len(alike) > 1 and not words:
             words = [", ".join(run.names)]
         result.append(", ".join([run.method, *words]))
@@ -209,8 +216,13 @@ def draw(runs: Sequence[Curves], out: pathlib.Path) -> None:
     panels = _panels(runs, PANELS | EMOTIONS)
     columns = min(4, len(panels))
     deep = -(-len(panels) // columns)
+    named = [labels([run for run in runs if run.task == task]) for task in tasks]
+    entry = 1 + 0.065 * max(len(label) for task in named for label in task)  # inches, at the legend's size of letters
+    wide = max(3.1 * columns, entry)
+    side_by_side = min(4, int(wide / entry))
+    high = 2.5 * deep + 0.16 * (max(map(len, named)) // side_by_side)
     with rc_context({"font.size": 9, "svg.fonttype": "none"}), writing(out) as partial:
-        figure = Figure(figsize=(3.1 * columns, 2.5 * deep * len(tasks) + 0.4), layout="constrained")
+        figure = Figure(figsize=(wide, high * len(tasks) + 0.4), layout="constrained")
         rows = figure.subfigures(len(tasks), 1, squeeze=False)[:, 0]
         for row, task in zip(rows, tasks, strict=True):
             chosen = [run for run in runs if run.task == task]
@@ -221,7 +233,7 @@ def draw(runs: Sequence[Curves], out: pathlib.Path) -> None:
                 axis.set_axis_off()
             row.suptitle(f"{task}: mean of the seeds, band from lowest to highest", fontsize=9)
             handles = axes[0].get_legend_handles_labels()
-            row.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+            row.legend(*handles, loc="outside lower center", ncols=side_by_side, frameon=False, fontsize=8)
         figure.savefig(partial, dpi=110, format=out.suffix[1:])
 
 

@@ -286,6 +286,24 @@ def test_runs_that_differ_in_seeds_alone_are_one_curve(tmp_path: pathlib.Path):
     assert report.labels(pooled) == ["mappo_l, lambda_lr = 0.1", "mappo_l, lambda_lr = 0.3"]
 
 
+def test_a_setting_that_a_run_does_not_name_has_its_default(tmp_path: pathlib.Path):
+    config = 'task = "lane"\nlambda_lr = 0.1\n'
+    settings = (config, config + "lr_half_life = inf\n", config + "lr_half_life = 1e6\n")
+    runs = [report.read(written(tmp_path / f"{i}", [row(10, 0, 1.0)], text)) for i, text in enumerate(settings)]
+    assert report.labels(runs) == [f"mappo_l, lr_half_life = {x}" for x in ("inf", "inf", "1e+06")]
+
+
+def test_long_names_of_many_runs_stand_below_one_another_and_within_the_picture(tmp_path: pathlib.Path):
+    config = 'task = "lane"\nlr_half_life = {0}\ncritic_lr = {0}\nminibatches = {0}\nrollout_length = {0}\n'
+    folders = [written(tmp_path / f"{i}", [row(10, 0, 1.0)], config.format(i)) for i in range(1, 9)]
+    out = tmp_path / "curves.svg"
+    report.draw([report.read(folder) for folder in folders], out)
+    names = re.findall(r'<text [^>]* x="([\d.-]+)" y="([\d.-]+)"[^>]*>(mappo_l, critic_lr[^<]*)<', out.read_text())
+    assert len(names) == 8 and len({y for _, y, _ in names}) == 8
+    width = float(re.findall(r'width="([\d.]+)pt"', out.read_text())[0])
+    assert all(0 < float(x) < width - 4 * len(text) for x, _, text in names)  # a letter is over 4 points wide
+
+
 def test_plot_draws_every_figure_that_there_is(lane: pathlib.Path, tmp_path: pathlib.Path, cli):
     plain = written(tmp_path / "plain", [row(10, 0, 1.0, episode_cost=0.5), row(20, 0, 2.0, episode_cost=None)])
     out = tmp_path / "curves.svg"
