@@ -31,6 +31,8 @@ from pmt_jax.run import setup
 from . import records, turns
 
 GPU_SIZE, CPU_SIZE = "5x2048x8", "1x64x64"
+PAPER = ["ant_2x4:mappo_l:1x512x16", "ant_2x4:mappo_l:5x512x16"]  # as pmt reproduce table1 --budget paper trains
+PAPER_MINIBATCHES = 16
 
 
 def measure(case: str, updates: int, repeats: int, fixed: dict[str, Any]) -> dict[str, Any]:
@@ -92,12 +94,15 @@ def main() -> None:
     parser.add_argument("fixed", nargs="*", metavar="SETTING=VALUE")
     arguments = parser.parse_intermixed_args()
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    size = GPU_SIZE if jax.devices()[0].platform == "gpu" else CPU_SIZE
-    cases = [c for c in arguments.cases.split(",") if c]
-    cases = cases or [f"ant_2x4:mappo_l:1x{size.split('x', 1)[1]}", *(f"ant_2x4:{method}:{size}" for method in METHODS)]
+    gpu = jax.devices()[0].platform == "gpu"
+    size = GPU_SIZE if gpu else CPU_SIZE
+    every = [f"ant_2x4:mappo_l:1x{size.split('x', 1)[1]}", *(f"ant_2x4:{method}:{size}" for method in METHODS)]
+    cases = [c for c in arguments.cases.split(",") if c] or every + PAPER * gpu
     rows = []
     for case in cases:
-        rows.append(measure(case, arguments.updates, arguments.repeats, dict(x.split("=", 1) for x in arguments.fixed)))
+        fixed = {"minibatches": PAPER_MINIBATCHES} if case in PAPER else {}
+        fixed |= dict(x.split("=", 1) for x in arguments.fixed)
+        rows.append(measure(case, arguments.updates, arguments.repeats, fixed))
         print(rows[-1], file=sys.stderr, flush=True)
         if arguments.out:
             records.write(arguments.out, rows)
