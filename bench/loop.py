@@ -32,7 +32,6 @@ from . import records, turns
 
 GPU_SIZE, CPU_SIZE = "5x2048x8", "1x64x64"
 PAPER = ["ant_2x4:mappo_l:1x512x16", "ant_2x4:mappo_l:5x512x16"]  # as pmt reproduce table1 --budget paper trains
-PAPER_MINIBATCHES = 16
 
 
 def measure(case: str, updates: int, repeats: int, fixed: dict[str, Any]) -> dict[str, Any]:
@@ -100,9 +99,7 @@ def main() -> None:
     cases = [c for c in arguments.cases.split(",") if c] or every + PAPER * gpu
     rows = []
     for case in cases:
-        fixed = {"minibatches": PAPER_MINIBATCHES} if case in PAPER else {}
-        fixed |= dict(x.split("=", 1) for x in arguments.fixed)
-        rows.append(measure(case, arguments.updates, arguments.repeats, fixed))
+        rows.append(measure(case, arguments.updates, arguments.repeats, dict(x.split("=", 1) for x in arguments.fixed)))
         print(rows[-1], file=sys.stderr, flush=True)
         if arguments.out:
             records.write(arguments.out, rows)
