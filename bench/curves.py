@@ -1,7 +1,7 @@
 """Training curves of run folders as a compact JSON, and a picture of such files.
 
-python -m bench.curves runs/ant --json bench/results/ant_2x4_mappo_l.json --png docs/ant_2x4_mappo_l.png
-python -m bench.curves --from bench/results/ant_2x4_mappo_l.json --png docs/ant_2x4_mappo_l.png
+python -m bench.curves runs/ant --json bench/results/ant_2x4_r4sg.json --png docs/ant_2x4_r4sg.png
+python -m bench.curves --from bench/results/ant_2x4_r4sg.json --png docs/ant_2x4_r4sg.png
 
 The picture is that of `pmt plot`, which draws run folders as they are.
 """
