@@ -51,7 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def answer(name: str, command: Callable[[], int]) -> int:
     """The exit code of `command`; a user's mistake gets one sentence that begins with the program's `name`, and 2."""
     try:
-        return command()
+        code = command()
+        sys.stdout.flush()  # here, where a reader that has gone away is noticed, and not when Python ends
+        return code
     except UsageError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

@@ -142,8 +142,10 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
 
 def test_output_that_nobody_reads_any_more(finished: pathlib.Path):
     command = f"{sys.executable} -m pmt_jax.cli eval {finished} --episodes 2 | true"
-    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert "Traceback" not in result.stderr and "BrokenPipe" not in result.stderr
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    for environment in (buffered, buffered | {"PYTHONUNBUFFERED": "1"}):
+        result = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True)
+        assert "Traceback" not in result.stderr and "BrokenPipe" not in result.stderr
 
 
 def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
