@@ -332,12 +332,13 @@ def _train(arguments: argparse.Namespace) -> int:
         cache=not arguments.no_cache,
         sinks=[name for name in arguments.sink.split(",") if name],
         profile=arguments.profile,
-        say=_say,
+        say=say,
         count=count,
     )
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Prints a line at once, into a pipe too."""
     print(line, flush=True)
 
 
@@ -358,7 +359,7 @@ def _eval(arguments: argparse.Namespace) -> int:
         how = f"policy {arguments.policy}"
     else:
         source, physics = pathlib.Path(arguments.source), arguments.physics
-        rows = experiment.evaluate_run(source, episodes, arguments.deterministic, arguments.which, physics, say=_say)
+        rows = experiment.evaluate_run(source, episodes, arguments.deterministic, arguments.which, physics, say=say)
         how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
         how += " of the best policy" if arguments.which == "best" else ""
     print(f"{arguments.source}: {episodes} episodes a seed, {how}; mean +- half-width of the 95 % interval")
@@ -378,7 +379,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
     from . import sweep
 
     points = sweep.grid(arguments.source, vary, arguments.preset, **_given(arguments))
-    return sweep.sweep(points, arguments.out, cache=not arguments.no_cache, say=_say, count=count, at_once=at_once)
+    return sweep.sweep(points, arguments.out, sweep.Launch(not arguments.no_cache, say, count, at_once))
 
 
 def _alone(command: str, jobs: str) -> int:
@@ -427,8 +428,8 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     from . import sweep
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
-    cache = not arguments.no_cache
-    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, cache, _say, count, at_once)
+    launch = sweep.Launch(not arguments.no_cache, say, count, at_once)
+    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, launch)
 
 
 def _whole(flag: str, text: str, least: int) -> int:
@@ -456,7 +457,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
     _quiet_xla()
     from . import doctor
 
-    return doctor.report(_say)
+    return doctor.report(say)
 
 
 def _render(arguments: argparse.Namespace) -> int:
@@ -482,7 +483,7 @@ def _render(arguments: argparse.Namespace) -> int:
         moments=slice(*steps),
         fps=fps,
         size=(width, height),
-        say=_say,
+        say=say,
     )
     return 0
 
@@ -491,7 +492,7 @@ def _plot(arguments: argparse.Namespace) -> int:
     from . import report
 
     report.plot(arguments.run_folders, arguments.out)
-    _say(f"wrote {arguments.out}")
+    say(f"wrote {arguments.out}")
     return 0
 
 
@@ -500,8 +501,8 @@ def _report(arguments: argparse.Namespace) -> int:
     _quiet_xla()
     from . import report
 
-    report.report(arguments.run_folders, arguments.out, episodes, say=_say)
-    _say(f"wrote {arguments.out}")
+    report.report(arguments.run_folders, arguments.out, episodes, say=say)
+    say(f"wrote {arguments.out}")
     return 0
 
 

@@ -9,14 +9,13 @@ import os
 import pathlib
 import signal
 import time
-import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from . import devices, folder, processes, tasks
+from . import devices, folder, interrupts, processes, tasks
 from .checkpoint import Checkpoints
 from .compiling import Programs, compile_run, evaluate_seeds, use_cache
 from .config import Config
@@ -189,7 +188,7 @@ def _loop(
     config, now = run.config, start
     begin = saved = time.monotonic()
     stop = 0
-    with _interruptible() as received:
+    with interrupts.noted(_next_kills) as received:
         while now.step < config.num_updates * config.batch_size:
             if stop := processes.agree(received[0] if received else 0):
                 break
@@ -339,24 +338,9 @@ def _keep_best(run: Run, programs: Programs, best: Best, state: LearnerState, ro
     )
 
 
-@contextlib.contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM end the loop after the running chunk; a second Ctrl-C kills the program at once."""
-    received: list[int] = []
-
-    def note(number: int, _: types.FrameType | None) -> None:
-        received.append(number)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # not an exception, which could land inside the physics
-
-    try:
-        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not in the main thread, where signals cannot be caught
-        before = {}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _next_kills(_: int) -> None:
+    """The loop ends after the running chunk; a second Ctrl-C kills the program at once."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

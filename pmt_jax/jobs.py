@@ -5,7 +5,7 @@ A process trains what `sweep.train_program` trains, says every line through its 
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import os
 import pathlib
 import signal
@@ -13,9 +13,9 @@ import subprocess
 import sys
 import threading
 import time
-import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
+from . import interrupts
 from .folder import Say
 
 POLL_SECONDS = 0.1
@@ -41,11 +41,15 @@ def run(commands: Sequence[Sequence[str]], at_once: int, say: Say) -> int:
     """
     waiting = [(number, list(words)) for number, words in enumerate(commands, 1)]
     running: dict[subprocess.Popen[str], threading.Thread] = {}
-    code = 0
-    with _passing_on(running) as received:
+    code = passed_on = 0
+    with interrupts.noted(lambda _: None) as received:
         while running or (waiting and not code and not received):
             while waiting and len(running) < at_once and not code and not received:
                 _start(*waiting.pop(0), running, say)
+            new = received[passed_on:]  # here and not in the handler, which may strike while a process is starting
+            passed_on += len(new)
+            for process, number in itertools.product(running, new):
+                process.send_signal(number)
             for process in [p for p in running if p.poll() is not None]:
                 running.pop(process).join()
                 code = code or process.returncode
@@ -66,24 +70,6 @@ def _start(number: int, words: list[str], running: dict[subprocess.Popen[str], t
     running[process].start()
 
 
-@contextlib.contextmanager
-def _passing_on(running: dict[subprocess.Popen[str], threading.Thread]) -> Iterator[list[int]]:
-    """Yields the list of signals that arrived; each was sent to all processes in `running`."""
-    received: list[int] = []
-
-    def pass_on(number: int, _: types.FrameType | None) -> None:
-        received.append(number)
-        for process in list(running):
-            process.send_signal(number)
-
-    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _end_with_parent() -> None:
     """Standard input ends when whoever started this process is gone, even by kill -9: save and end then."""
     sys.stdin.read()
@@ -97,12 +83,9 @@ def main() -> int:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     folder, out, cache, count = sys.argv[1:]
 
-    def say(line: str) -> None:
-        print(line, flush=True)
-
     def train() -> int:
         devices = int(count) if count else None
-        return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
+        return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), cli.say, devices)
 
     return cli.answer("pmt", train)
 

@@ -17,6 +17,7 @@ import numpy as np
 from .config import Config
 from .errors import UsageError, optional
 from .files import read_rows, writing
+from .table import SAME_IN_A_ROW, plain
 
 POINTS = 100  # of a curve
 PANELS = {
@@ -36,8 +37,7 @@ EMOTIONS = {
     "regret/weight_std": "regret: spread of the weights",
 }
 COLOURS = ("#2f7fb5", "#e0861a", "#2f9e77", "#c8503f", "#8d6bb8", "#9a7b4f", "#d264a8", "#7f8a91")
-# Settings in which repetitions of a run may differ.
-SEEDS_AND_LENGTH = ("seed", "seeds", "steps", "num_updates", "log_interval", "eval_interval", "eval_episodes")
+SEEDS_AND_LENGTH = (*SAME_IN_A_ROW, "steps", "num_updates")  # settings in which repetitions of a run may differ
 IDENTITY = {"step", "seed", "task", "method", "cost_limit"}  # what every row of a run says of itself
 ENDINGS = (".png", ".svg", ".pdf")
 _INK = "#808182"  # stands for the reader's own text colour in pictures inside pages
@@ -176,8 +176,7 @@ def labels(runs: Sequence[Curves]) -> list[str]:
     """What tells each run from the others of its task: the method, and settings that others of it have otherwise."""
 
     def value(run: Curves, name: str) -> str:  # a run of before a setting came to be has its default
-        x = run.settings.get(name, getattr(Config, name, "default"))
-        return f"{x:g}" if isinstance(x, float) else str(x)
+        return plain(run.settings.get(name, getattr(Config, name, "default")))
 
     result = []
     for run in runs:

@@ -13,7 +13,7 @@ import pathlib
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,25 @@ Points = dict[str, Config]  # by the name of the point's folder
 
 # The cost limit is traced too, but what is written about a run is written for one limit.
 TRACED = tuple(name for name in HYPER_FIELDS if name != "cost_limit")
+
+
+class Launch(NamedTuple):
+    """How programs are trained.
+
+    Attributes:
+      cache: keep compiled programs on disk.
+      say: prints a line.
+      count: of devices, as for `experiment.train`.
+      at_once: programs that train at a time, each in a process of its own where it is more than one.
+    """
+
+    cache: bool = True
+    say: Say = print
+    count: int | None = None
+    at_once: int = 1
+
+
+ONE_AT_A_TIME = Launch()
 
 
 def grid(
@@ -64,37 +83,20 @@ def _word(value: str) -> str:
         return re.sub(r"[^\w.=,+-]", "-", value)
 
 
-def sweep(
-    points: Points,
-    out: pathlib.Path,
-    cache: bool = True,
-    say: Say = print,
-    count: int | None = None,
-    at_once: int = 1,
-) -> int:
+def sweep(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
-    code = train_points(points, out, cache, say, count, at_once)
+    code = train_points(points, out, launch)
     if code == 0:
-        say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
+        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+        launch.say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
     return code
 
 
-def reproduce(
-    name: str,
-    budget: str,
-    out: pathlib.Path,
-    form: str = "text",
-    cache: bool = True,
-    say: Say = print,
-    count: int | None = None,
-    at_once: int = 1,
-) -> int:
+def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
 
     Args:
       name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
-      count: of devices, as for `experiment.train`; at_once: programs that train at a time.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
@@ -110,13 +112,13 @@ def reproduce(
     plans = {task: _plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
     for points in plans.values():
         setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
-    programs = [program for task, points in plans.items() for program in _programs(points, out / task, say)]
-    code = _train(programs, cache, say, count, at_once)
+    programs = [program for task, points in plans.items() for program in _programs(points, out / task, launch.say)]
+    code = _train(programs, launch)
     if code:
         return code
     rows = table.rows([out / task / point for task, points in plans.items() for point in points])
-    say(f"\n{wanted['title']}, budget '{budget}'\n")
-    say(table.render(rows, form, wanted["baseline"]))
+    launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
+    launch.say(table.render(rows, form, wanted["baseline"]))
     return 0
 
 
@@ -126,20 +128,10 @@ def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
     return grid(task, {"method": methods}, **{**shared, **budget.get("tasks", {}).get(task, {})})
 
 
-def train_points(
-    points: Points,
-    out: pathlib.Path,
-    cache: bool = True,
-    say: Say = print,
-    count: int | None = None,
-    at_once: int = 1,
-) -> int:
+def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains what is missing of `points`, each into its own folder under `out`.
 
     Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
-
-    Args:
-      count: of devices, as for `experiment.train`; at_once: programs that train at a time, each in its own process.
 
     Returns:
       The exit code of `experiment.train`: 0 when all points are finished.
@@ -147,7 +139,7 @@ def train_points(
     Raises:
       UsageError: `out` holds a point of the same name with other settings.
     """
-    return _train(_programs(points, out, say), cache, say, count, at_once)
+    return _train(_programs(points, out, launch.say), launch)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +150,11 @@ class _Program:
     points: Points
     out: pathlib.Path
 
+    def title(self, number: int, count: int) -> str:
+        """What is said of it, the `number`-th of `count`."""
+        seeds = next(iter(self.points.values())).seeds
+        return f"program {number} of {count}: {len(self.points)} point(s) x {seeds} seed(s) side by side"
+
 
 def _programs(points: Points, out: pathlib.Path, say: Say) -> list[_Program]:
     """What is missing of `points`."""
@@ -167,19 +164,17 @@ def _programs(points: Points, out: pathlib.Path, say: Say) -> list[_Program]:
     return [_Program(folder, group, out) for folder, group in _groups(points, missing, out)]
 
 
-def _train(programs: Sequence[_Program], cache: bool, say: Say, count: int | None, at_once: int) -> int:
+def _train(programs: Sequence[_Program], launch: Launch) -> int:
     """Trains programs one after the other, or several at a time in processes of their own."""
-    titles = []
-    for number, program in enumerate(programs, 1):
-        first = next(iter(program.points.values()))
-        size = f"{len(program.points)} point(s) x {first.seeds} seed(s) side by side"
-        titles.append(f"program {number} of {len(programs)}: {size}")
+    cache, say, count, at_once = launch
+    for program in programs:
         _write_points(program)
+    titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
     if at_once > 1:
-        for title, program in zip(titles, programs, strict=True):
+        for title, program in titled:
             say(f"{title}, {program.out.name}: {', '.join(program.points)}")
         return jobs.run([jobs.command(p.folder, p.out, cache, count) for p in programs], at_once, say)
-    for title, program in zip(titles, programs, strict=True):
+    for title, program in titled:
         say(title)
         code = train_program(program.folder, program.out, cache, say, count)
         if code:

@@ -158,10 +158,11 @@ def _essence(config: Config) -> str:
 def _differing(config: Config, rivals: Sequence[Config]) -> str:
     names = [f.name for f in dataclasses.fields(config) if f.name not in SAME_IN_A_ROW]
     apart = [n for n in names if len({repr(getattr(rival, n)) for rival in rivals}) > 1]
-    return " ".join(f"{n}={_plain(getattr(config, n))}" for n in apart)
+    return " ".join(f"{n}={plain(getattr(config, n))}" for n in apart)
 
 
-def _plain(value: Any) -> str:
+def plain(value: Any) -> str:
+    """A setting's value, numbers as short as they can be."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
