@@ -125,11 +125,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest batch of each task and engine, once")
     parser.add_argument("--tasks", default="", metavar="NAMES", help="only these tasks, with commas")
+    parser.add_argument("--physics", default="", metavar="ENGINE", help="only rows of this engine")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=pathlib.Path)
     arguments = parser.parse_args()
     cases = GPU if jax.devices()[0].platform == "gpu" else CPU
     chosen = [case for case in cases if not arguments.tasks or case[0] in arguments.tasks.split(",")]
+    if arguments.physics:
+        chosen = [case for case in chosen if case[1].get("physics") == arguments.physics]
     if arguments.quick:
         smallest = {(task, *options.values()): None for task, options, *_ in chosen}
         chosen = [next(c for c in chosen if (c[0], *c[1].values()) == key) for key in smallest]
