@@ -215,7 +215,7 @@ def _add_table(commands: Any) -> None:
     table = commands.add_parser(
         "table",
         help="compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
-        description="One row per task, method and settings: interquartile means with 95 %% bootstrap intervals.",
+        description="One row per task, method and settings: interquartile means with 95 % bootstrap intervals.",
         allow_abbrev=False,
     )
     table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")

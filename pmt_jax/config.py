@@ -31,6 +31,7 @@ class Hyper:
       actor_lr: Adam step size of the actors.
       critic_lr: Adam step size of the reward critic and the cost critic.
       lr_half_life: environment steps of a seed in which all Adam step sizes halve; inf keeps them.
+      kl_max: how far an update by clipped epochs may move a policy, mean KL in nats; beyond it the step is shortened.
       max_grad_norm: gradients are scaled down to this global norm.
       discount: per control step, for reward and cost alike.
       trace_decay: lambda of generalised advantage estimation, for reward and cost alike.
@@ -60,6 +61,7 @@ class Hyper:
     actor_lr: float = 3e-4
     critic_lr: float = 1e-3
     lr_half_life: float = math.inf
+    kl_max: float = math.inf
     max_grad_norm: float = 10.0
     discount: float = 0.99
     trace_decay: float = 0.95
@@ -388,6 +390,8 @@ def _validate(config: Config) -> None:
     for name in ("kappa", "omega", "temperature", "damping", "kl_limit", "first_step", "step_decay", "kl_slack"):
         if not getattr(config, name) >= 0:
             raise UsageError(f"{name} must be a number that is not negative, not {getattr(config, name)}")
+    if not config.kl_max > 0:
+        raise UsageError(f"kl_max must be a number of nats above 0, or inf, not {config.kl_max}")
     if not config.lr_half_life > 0:
         raise UsageError(f"lr_half_life must be a number of steps above 0, or inf, not {config.lr_half_life}")
     if not 0 <= config.regret_max < 1:

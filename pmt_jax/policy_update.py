@@ -157,7 +157,18 @@ def _clipped_epochs(run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, key:
         return -gain.mean() - hyper.entropy_coef * entropy, metrics
 
     passes = {"epochs": run.config.epochs, "minibatches": run.config.minibatches}
-    return fit(net, loss, rows, key, learning_rate=hyper.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
+    new, metrics = fit(net, loss, rows, key, learning_rate=hyper.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
+    params, metrics["share_of_step"] = _shortened(run, hyper.kl_max, net.params, new.params, rows)
+    return Trained(params, new.opt_state), metrics
+
+
+def _shortened(run: Run, kl_max: jax.Array, old: Params, new: Params, rows: PolicyRows) -> tuple[Params, jax.Array]:
+    """Weights on the way from `old` to `new` where KL(old || new) is about `kl_max`, and that share of the way; `new`
+    itself, bit for bit, and 1 where it is no further. To second order the divergence is the way's square.
+    """
+    _, kl = _moved(run, new, rows)
+    share = jnp.sqrt(jnp.minimum(1.0, kl_max / jnp.maximum(kl, 1e-12)))
+    return jax.tree.map(lambda x, y: jnp.where(share < 1, x + share * (y - x), y), old, new), share
 
 
 def _trust_region_steps(

@@ -76,6 +76,7 @@ def test_words_of_a_command_line_become_typed():
         ({"discount": 1.5}, r"discount must lie in [0, 1], not 1.5"),
         ({"actor_lr": -1}, "actor_lr must be a number that is not negative"),
         ({"actor_lr": float("nan")}, "actor_lr must be a number that is not negative"),
+        ({"kl_max": 0}, "kl_max must be a number of nats above 0, or inf"),
         ({"lr_half_life": 0}, "lr_half_life must be a number of steps above 0, or inf"),
         ({"cost_limit": -2}, "cost_limit must be a cost per episode of at least 0"),
         ({"hidden": ()}, "hidden must name at least one layer"),

@@ -196,6 +196,30 @@ def test_step_sizes_of_all_networks_halve_in_their_half_life():
         chex.assert_trees_all_equal(second.actor, step(run.hyper, first).actor)
 
 
+@pytest.mark.parametrize("method", ["mappo", "r4sg"])
+def test_an_update_moves_no_policy_further_than_kl_max(method):
+    """A shared actor moves for all agents at once, so its bound holds for their mean."""
+    run = setup(load_config("lane", method=method, actor_lr=3e-3, **SMALL))
+    step = jax.jit(lambda hyper, state: learner.train_step(run, hyper, state))
+    start = learner.init(run, run.hyper, jax.random.key(0))
+    free, figures = step(run.hyper, start)
+    far = np.asarray(figures["actor/kl_per_agent"])
+    held, held_figures = step(dataclasses.replace(run.hyper, kl_max=jnp.float32(far.mean() / 16)), start)
+    near = np.asarray(held_figures["actor/kl_per_agent"])
+    assert figures["actor/share_of_step"] == 1.0
+    np.testing.assert_allclose(near.mean(), far.mean() / 16, rtol=0.2)
+    if method == "mappo":  # one step of all: the same way, a quarter of it (agents in turn answer to those before them)
+        share = held_figures["actor/share_of_step"]
+        np.testing.assert_allclose(share, 0.25, rtol=1e-5)
+        chex.assert_trees_all_close(
+            held.actor.params,
+            jax.tree.map(lambda x, y: x + share * (y - x), start.actor.params, free.actor.params),
+            atol=1e-6,
+        )
+    never = dataclasses.replace(run.hyper, kl_max=jnp.float32(2 * far.max()))
+    chex.assert_trees_all_equal(step(never, start)[0], free)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # More costs than one
 
