@@ -162,7 +162,9 @@ def _clipped_epochs(run: Run, hyper: Hyper, net: Trained, rows: PolicyRows, key:
     return Trained(params, new.opt_state), metrics
 
 
-def _shortened(run: Run, kl_max: jax.Array, old: Params, new: Params, rows: PolicyRows) -> tuple[Params, jax.Array]:
+def _shortened(
+    run: Run, kl_max: jax.Array | float, old: Params, new: Params, rows: PolicyRows
+) -> tuple[Params, jax.Array]:
     """Weights on the way from `old` to `new` where KL(old || new) is about `kl_max`, and that share of the way; `new`
     itself, bit for bit, and 1 where it is no further. To second order the divergence is the way's square.
     """
