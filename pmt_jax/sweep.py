@@ -173,7 +173,8 @@ def _train(programs: Sequence[_Program], launch: Launch) -> int:
     if at_once > 1:
         for title, program in titled:
             say(f"{title}, {program.out.name}: {', '.join(program.points)}")
-        return jobs.run([jobs.command(p.folder, p.out, cache, count) for p in programs], at_once, say)
+        spread = jobs.gpus() if count is None else ()  # a number of devices means those, for every program
+        return jobs.run([jobs.command(p.folder, p.out, cache, count) for p in programs], at_once, say, spread)
     for title, program in titled:
         say(title)
         code = train_program(program.folder, program.out, cache, say, count)

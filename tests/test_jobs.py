@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import types
 
 import pytest
 
@@ -43,6 +44,29 @@ def test_so_many_at_a_time_and_no_more(tmp_path: pathlib.Path):
     assert jobs.run([meeting] * 5, 2, said.append) == 0
     assert sorted(line.split()[0] for line in said) == [f"[{i}]" for i in range(1, 6)]
     assert max(int(line.split()[1]) for line in said) == 2
+
+
+def test_programs_are_spread_over_the_gpus(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    meeting = program(f"""
+        import pathlib, os, time
+        here, mine = pathlib.Path({str(tmp_path)!r}), os.environ.get("CUDA_VISIBLE_DEVICES")
+        (here / f"begun-{{os.getpid()}}").touch()
+        while len(list(here.glob("begun-*"))) < 4:
+            time.sleep(0.01)
+        print(mine)
+    """)
+    said: list[str] = []
+    assert jobs.run([meeting] * 4, 4, said.append, ("3", "5")) == 0
+    assert sorted(line.split()[1] for line in said) == ["3", "3", "5", "5"]
+    assert jobs.gpus() == ()  # a CPU is shared as it is
+    gpu = types.SimpleNamespace(platform="gpu")
+    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu, gpu])
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert jobs.gpus() == ("0", "1")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,GPU-7")
+    assert jobs.gpus() == ("2", "GPU-7")
+    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu])
+    assert jobs.gpus() == ()
 
 
 def test_after_a_failure_no_other_is_started_and_those_that_run_go_on():
