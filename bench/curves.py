@@ -3,7 +3,8 @@
 python -m bench.curves runs/ant --json bench/results/ant_2x4_r4sg.json --png docs/ant_2x4_r4sg.png
 python -m bench.curves --from bench/results/ant_2x4_r4sg.json --png docs/ant_2x4_r4sg.png
 
-The picture is that of `pmt plot`, which draws run folders as they are.
+The picture is that of `pmt plot`, which draws run folders as they are. The block `<!-- bench: curves:ant_2x4_r4sg -->`
+of a document becomes the table of that file (bench/render.py).
 """
 
 from __future__ import annotations
@@ -16,19 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from pmt_jax import report
+from pmt_jax import report, table
+from pmt_jax.errors import UsageError
 
 FIGURES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
 
 
 def compact(folder: pathlib.Path) -> dict[str, Any]:
-    """A run's curves per seed, with what it takes to make it again: {name: [seeds][points]}, None where unknown."""
-    curves = report.read(folder, FIGURES)
+    """A run's curves per seed, its figures in a table, and what it takes to make it again.
+
+    Curves are {name: [seeds][points]}, None where unknown; `table` is {column: [seeds]}, see `pmt_jax.table`.
+    """
+    curves, (row,) = report.read(folder, FIGURES), table.rows([folder])
     figures = {name: [[_rounded(x) for x in seed] for seed in curves.figures[name]] for name in FIGURES}
     return {
         "steps": curves.steps.tolist(),
         "seeds": list(curves.seeds),
         **figures,
+        "table": {column: [_short(x) for x in seeds] for column, seeds in row.figures.items()},
+        "source": row.source,
         "task": curves.task,
         "method": curves.method,
         "cost_limit": curves.cost_limit,
@@ -40,6 +47,10 @@ def compact(folder: pathlib.Path) -> dict[str, Any]:
 
 def _rounded(x: float) -> float | None:
     return round(float(x), 4) if np.isfinite(x) else None
+
+
+def _short(x: float) -> float | None:
+    return float(f"{x:.6g}") if np.isfinite(x) else None
 
 
 def curves(stored: dict[str, Any]) -> report.Curves:
@@ -55,6 +66,25 @@ def curves(stored: dict[str, Any]) -> report.Curves:
         figures={name: np.array(stored[name], float) for name in FIGURES},
         seconds=stored["seconds"],
     )
+
+
+def markdown(file: pathlib.Path) -> str:
+    """The runs of a JSON file as a table, with what its figures mean.
+
+    Raises:
+      UsageError: the file is not there, or is not what `compact` makes.
+    """
+    try:
+        stored = json.loads(file.read_text())
+        rows = [_row(run) for run in stored]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{file} holds no runs that bench.curves wrote ({type(error).__name__}: {error})") from None
+    return table.render(rows, "markdown").strip()
+
+
+def _row(run: dict[str, Any]) -> table.Row:
+    figures = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
+    return table.Row(run["task"], run["method"], "", run["cost_limit"], max(run["steps"]), run["source"], figures)
 
 
 def main() -> None:

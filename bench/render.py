@@ -1,7 +1,8 @@
 """Tables in the documentation, made from bench/results.
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
-bench/tables.py makes of the results; whatever stood there before is replaced.
+bench/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` stands for the
+table, as `pmt table` makes it, of the runs in bench/results/FILE.json, which bench/curves.py wrote.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
+from . import curves
 from .compare import RESULTS, Report, load
 from .tables import TABLES
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
+CURVES = "curves:"
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
 
 
@@ -37,6 +40,8 @@ def render(text: str, reports: dict[str, Report]) -> str:
 
     def block(found: re.Match[str]) -> str:
         begin, name, _, end = found.groups()
+        if name.startswith(CURVES):
+            return f"{begin}{curves.markdown(RESULTS / f'{name.removeprefix(CURVES)}.json')}\n{end}"
         if name not in TABLES:
             raise UsageError(f"unknown table '{name}'{did_you_mean(name, TABLES)}")
         return f"{begin}{TABLES[name](reports)}\n{end}"

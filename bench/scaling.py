@@ -10,14 +10,15 @@
 | strong | one seed of B environments | B / D environments |
 
 `steps_per_second` counts the environment steps of all seeds, the median over `--repeats` rounds, in which the programs
-of a task take turns. `efficiency` is that over D times the rate of one device with one seed of B environments, of which
-weak scaling keeps 1 where devices do not slow each other down. Devices made of one CPU by XLA_FLAGS share its cores, so
-there the figures show that it runs, not how well. Results are written after every task.
+of a task take turns (they are compiled together). `efficiency` is that over D times the rate of one device with one
+seed of B environments, of which weak scaling keeps 1 where devices do not slow each other down. Devices made of one CPU
+by XLA_FLAGS share its cores, so there the figures show that it runs, not how well. Results are written task by task.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
 import dataclasses
 import pathlib
 import statistics
@@ -78,7 +79,9 @@ def measure(task: str, size: tuple[int, int], counts: list[int], arguments: argp
             ("weak, seeds", count, one | {"seeds": count}),
             ("strong", count, one),
         ]
-    contestants = [enter(task, *split, arguments.method) for split in splits]
+    with concurrent.futures.ThreadPoolExecutor() as pool:  # compiling is most of the time that a rented host is held
+        begun = [pool.submit(enter, task, scaling, count, sizes, arguments.method) for scaling, count, sizes in splits]
+        contestants = [future.result() for future in begun]
     for _ in range(arguments.repeats + 1):
         for contestant in contestants:
             contestant.turn()
@@ -98,7 +101,6 @@ def _row(contestant: Contestant, alone: float) -> dict[str, Any]:
         "rollout_length": config.rollout_length,
         "steps_per_second": round(contestant.rate),
         "efficiency": round(contestant.rate / (contestant.count * alone), 3),
-        "compile_seconds": round(contestant.compile_seconds, 1),
     }
 
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from bench import compare, records, render, suite, tables
+from bench import compare, curves, records, render, suite, tables
 from bench.__main__ import main
+from pmt_jax import table
 
 FAKE = """
 import json, os, signal, sys
@@ -141,6 +142,30 @@ def test_rendering_replaces_blocks_and_nothing_else():
     for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
         with pytest.raises(compare.UsageError):
             render.render(broken, reports)
+
+
+def test_a_block_of_curves_is_the_table_of_their_runs(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.toml").write_text('task = "lane"\nmethod = "happo"\nseeds = 2\n')
+    (run / "versions.json").write_text("{}")
+    names = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
+    log = [
+        {"step": step, "seed": seed, "task": "lane", "method": "happo", "cost_limit": 2.0, "seconds": 1.0}
+        | {name: (i + 1) * (step + seed) / 3 for i, name in enumerate(names)}
+        for step in range(1, 301)
+        for seed in (0, 1)
+    ]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in log))
+    (tmp_path / "two.json").write_text(json.dumps([curves.compact(run)]))
+    monkeypatch.setattr(render, "RESULTS", tmp_path)
+    block = "<!-- bench: curves:two -->\n{}<!-- /bench -->\n"
+    of_runs = table.render(table.rows([run]), "markdown").strip()
+    assert render.render(block.format("old\n"), {}) == block.format(of_runs + "\n")
+    (tmp_path / "two.json").write_text("[{}]")
+    for name in ("two", "none"):
+        with pytest.raises(compare.UsageError, match=f"{name}.json"):
+            render.render(block.format("").replace("two", name), {})
 
 
 def test_tables_of_a_gpu():
