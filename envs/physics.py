@@ -506,8 +506,7 @@ class WarpEngine:
         settings: dict[str, Any] = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
         if _needs_post_constraint(readout):
             settings["opt._impl.run_rne_postconstraint"] = True
-        with jax.ensure_compile_time_eval():
-            self._model = mjx.put_model(model, impl="warp").tree_replace(settings)
+        self._model = _constant(lambda: mjx.put_model(model, impl="warp").tree_replace(settings))
 
     def start(self) -> PhysicsState:
         return _start(self._c_model)
@@ -539,14 +538,23 @@ class WarpEngine:
         """Warp keeps the contacts of all worlds in one buffer, so its size depends on the batch."""
         mjx = import_mjx()
         size = self._contacts * batch
-        with jax.ensure_compile_time_eval():
-            data = mjx.make_data(self._c_model, impl="warp", naconmax=size, njmax=self._rows)
+        data = _constant(lambda: mjx.make_data(self._c_model, impl="warp", naconmax=size, njmax=self._rows))
 
         def slim(leaf: Any) -> Any:  # the empty buffers are uniform: keep them out of the program's constants
-            large = getattr(leaf, "ndim", 0) > 0 and leaf.shape[0] == size and size > 1
+            large = leaf.ndim > 0 and leaf.shape[0] == size and size > 1
             return jnp.broadcast_to(leaf[:1], leaf.shape) if large else leaf
 
         return jax.tree.map(slim, data)
+
+
+def _constant(make: Callable[[], Any]) -> Any:
+    """What `make` builds of JAX arrays, as NumPy's, wherever it is called from.
+
+    MJX asks for its arrays' shapes per shard, which inside a `shard_map` nobody can say, so `make` runs outside of any
+    mesh; and an array that lies on one device is no constant of a program for several.
+    """
+    with jax.ensure_compile_time_eval(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        return jax.tree.map(np.asarray, make())
 
 
 def _flattened(batched: Any) -> Any:

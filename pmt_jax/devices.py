@@ -54,6 +54,9 @@ def make_mesh(config: Config, count: int | None) -> Mesh | None:
         return None
     seeds = math.gcd(config.seeds, count)
     _check_even(config, count, seeds)
+    # As inputs of what each device runs apart (`apart`), constants without entries, of which MJX-Warp has many, bring
+    # XLA's partitioner down (jaxlib 0.11.2); so constants stay where they are used.
+    jax.config.update("jax_use_simplified_jaxpr_constants", True)
     axes = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((seeds, count // seeds), (SEED, ENV), axes, devices=present[:count])
 

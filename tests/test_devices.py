@@ -50,6 +50,9 @@ def train(count, task, **sizes):
     return program, {**checkpoint.pack(state), **{k: np.asarray(x) for k, x in metrics.items()}}
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
+if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
+    from envs import physics
+    physics.obstacle = lambda name: None
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
 apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))
@@ -79,6 +82,12 @@ def test_seeds_and_environments_split_change_nothing_but_rounding():
     assert found["leaves"] > 100 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
+
+
+def test_warp_steps_each_devices_own_environments():
+    pytest.importorskip("warp")
+    found = compare("ant_2x4", method="mappo_l", seeds=2, num_envs=8, physics="warp")
+    assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
 
 
 @pytest.mark.slow
