@@ -69,7 +69,7 @@ def curves(stored: dict[str, Any]) -> report.Curves:
 
 
 def markdown(file: pathlib.Path) -> str:
-    """The runs of a JSON file as a table, with what its figures mean.
+    """The runs of a JSON file as a table, without the sentences below it that say what its figures mean.
 
     Raises:
       UsageError: the file is not there, or is not what `compact` makes.
@@ -79,7 +79,7 @@ def markdown(file: pathlib.Path) -> str:
         rows = [_row(run) for run in stored]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file} holds no runs that bench.curves wrote ({type(error).__name__}: {error})") from None
-    return table.render(rows, "markdown").strip()
+    return table.render(table.in_order(rows), "markdown").split("\n\n")[0]
 
 
 def _row(run: dict[str, Any]) -> table.Row:

@@ -114,12 +114,17 @@ def rows(folders: Sequence[pathlib.Path]) -> list[Row]:
     groups: dict[tuple[str, str, str], list[_Found]] = {}
     for found in map(_read, folders):
         groups.setdefault((found.task, found.config.method, _essence(found.config)), []).append(found)
-    order = list(METHODS)
     result = []
     for (task, method, _), runs in groups.items():
         rivals = [g[0].config for (t, m, _), g in groups.items() if (t, m) == (task, method)]
         result.append(_pool(task, runs, _differing(runs[0].config, rivals)))
-    return sorted(result, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
+    return in_order(result)
+
+
+def in_order(rows: Sequence[Row]) -> list[Row]:
+    """Sorted by task, then as METHODS is; methods that are not in it last."""
+    order = list(METHODS)
+    return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
 
 
 def _read(folder: pathlib.Path) -> _Found:
