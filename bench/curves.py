@@ -34,7 +34,7 @@ def compact(folder: pathlib.Path) -> dict[str, Any]:
         "steps": curves.steps.tolist(),
         "seeds": list(curves.seeds),
         **figures,
-        "table": {column: [_short(x) for x in seeds] for column, seeds in row.figures.items()},
+        "table": {column: [_rounded(x) for x in seeds] for column, seeds in row.figures.items()},
         "source": row.source,
         "task": curves.task,
         "method": curves.method,
@@ -46,10 +46,6 @@ def compact(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _rounded(x: float) -> float | None:
-    return round(float(x), 4) if np.isfinite(x) else None
-
-
-def _short(x: float) -> float | None:
     return float(f"{x:.6g}") if np.isfinite(x) else None
 
 
