@@ -149,7 +149,7 @@ class AntCorridor:
         terminated = self._get_termination(after, out["torso_xquat"])
         cost, cost_parts = self._get_cost(out["torso_xpos"], terminated)
         obs, global_state = self._get_obs(after)
-        info = reward_parts | cost_parts | {"x_position": out["torso_xpos"][0], "physics_overflow": out["overflow"]}
+        info = reward_parts | cost_parts | _place(out["torso_xpos"]) | {"physics_overflow": out["overflow"]}
         return State(obs, global_state, reward, cost, terminated, info, Carry(after, out["torso_xpos"]))
 
     def restore(self, qpos: Any, qvel: Any, warmstart: Any = None, torso_xpos: Any = None) -> State:
@@ -203,7 +203,7 @@ class AntCorridor:
         zero = jnp.zeros((), torso_xpos.dtype)
         names = ("forward", "ctrl", "contact", "survive")
         info = {f"reward_{name}": zero for name in names} | {"cost_obj": zero, "cost_done": zero}
-        info |= {"x_position": torso_xpos[0], "physics_overflow": zero}
+        info |= _place(torso_xpos) | {"physics_overflow": zero}
         cost = jnp.zeros((self.spec.num_agents, 1), zero.dtype)
         return State(obs, global_state, zero, cost, jnp.zeros((), bool), info, Carry(physics, torso_xpos))
 
@@ -258,6 +258,12 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
     centre = jnp.where((x > first) & (x < second), (2 * first - x) * SLOPE, centre)
     centre = jnp.where((x > second) & (x < third), (x - third + first) * SLOPE, centre)
     return y - centre
+
+
+def _place(torso: jax.Array) -> dict[str, jax.Array]:
+    """How far the ant is along x (m), and 1 where it is `outside`: walls do not block, and past their bands nothing costs."""
+    outside = jnp.abs(off_centre(torso[0], torso[1])) > HALF_WIDTH
+    return {"x_position": torso[0], "outside": outside.astype(torso.dtype)}
 
 
 def in_danger(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -274,6 +274,16 @@ def test_centre_line_is_continuous_at_the_folds():
         assert abs(left - right) < 2e-3
 
 
+def test_an_ant_behind_a_wall_is_outside_and_behind_the_band_costs_nothing():
+    env, step = stepper("mujoco")
+    rest = np.asarray(env.raw(env.reset(jax.random.key(0)))["qpos"])
+    centre = 10 * np.tan(np.pi / 6)  # of the corridor, at x = 30
+    qpos = np.stack([np.r_[30.0, centre + off, rest[2:]] for off in (0.0, -4.5, 4.5, -5.5, 5.5, 9.0)])
+    after = step(jax.vmap(env.restore)(qpos, np.zeros((6, 14))), jnp.zeros((6, 2, 4)))
+    np.testing.assert_array_equal(after.info["outside"], [0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(after.cost[:, 0, 0], [0, 1, 1, 1, 1, 0])
+
+
 def test_broken_physics_terminates_and_shows():
     env, _ = stepper("mujoco")
     state = env.step(env.reset(jax.random.key(0)), jnp.full((2, 4), jnp.nan))
