@@ -30,6 +30,7 @@ FIGURES = {
     "reward": "episode_reward",
     "cost": "episode_cost",
     "violation rate": "violation_rate",
+    "outside": "info/outside",
     "CR": "info/totally_controllable_ratio",
     "PL": "info/total_line_loss",
 }
@@ -332,6 +333,8 @@ def _notes(data: Sequence[dict[str, Any]], baseline: str | None, together: dict[
         "episode; limit: the cost allowed; violation rate: share of steps with a cost above 0 for some agent.",
         "Interquartile mean over seeds [95 % stratified bootstrap interval]; -: unknown, or not finite for some seed.",
     ]
+    if any("outside" in row for row in data):
+        notes.append("outside: share of steps beyond a wall; walls do not block, and behind their bands nothing costs.")
     if any("CR" in row for row in data):
         notes.append("CR: share of steps with every bus in the band; PL: losses in lines, MW.")
     if baseline:

@@ -192,6 +192,16 @@ def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
     assert data["mappo_l"]["better"] is None
 
 
+def test_a_table_says_who_left_the_corridor(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "ant_2x4", "happo", {0: [1, 1]}, **{"info/outside": 0.5})
+    made(tmp_path / "b", "lane", "happo", {0: [1, 1]})
+    assert "outside: share of steps beyond a wall" in cli("table", tmp_path / "a")[1]
+    head, _, ant, lane = cli("table", tmp_path)[1].splitlines()[:4]
+    place = head.index("outside")
+    assert ant[place:].startswith("0.5 ") and lane[place:].startswith("- ")
+    assert "outside" not in cli("table", tmp_path / "b")[1]
+
+
 def test_settings_that_differ_make_rows_of_their_own(tmp_path: pathlib.Path, cli):
     made(tmp_path / "a", "lane", "happo", {0: [1, 1]}, clip=0.1)
     made(tmp_path / "b", "lane", "happo", {0: [2, 2]}, clip=0.2)
