@@ -24,6 +24,7 @@ from . import devices, processes
 from .errors import UsageError
 
 KEEP = 2
+_INFO = ".rollout.vector.env.info["  # in the path of what environments told
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -39,18 +40,21 @@ def pack(tree: Any) -> dict[str, np.ndarray]:
 def unpack(packed: dict[str, np.ndarray], like: Any) -> Any:
     """The inverse of `pack`; `like` gives structure, shapes and dtypes.
 
+    What an environment's last step told besides (`info`) may differ: nobody goes on from it, and so a task may come to
+    tell more without making older checkpoints useless. What is not there is 0.
+
     Raises:
       UsageError: paths, shapes or dtypes differ.
     """
     leaves, treedef = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): x for path, x in leaves}
     wanted = {path for path, x in expected.items() if x.size}
-    if wanted != set(packed):
-        difference = sorted(wanted ^ set(packed))
+    difference = sorted(path for path in wanted ^ set(packed) if _INFO not in path)
+    if difference:
         raise UsageError(f"the checkpoint belongs to another kind of run: it differs in {', '.join(difference[:3])}")
 
     def restore(path: str, x: Any) -> jax.Array:
-        if not x.size:
+        if path not in packed:
             return jnp.zeros(x.shape, x.dtype)
         data = jnp.asarray(packed[path])
         value = jax.random.wrap_key_data(data) if _is_key(x) else data

@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pmt_jax import checkpoint, doctor, experiment, load_config, load_policy, normalise, numpy_policy, setup, sinks
+from pmt_jax.errors import UsageError
 from pmt_jax.evaluation import improves, interval
 from pmt_jax.policy import weights
 
@@ -183,6 +184,18 @@ def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
     assert code == 0 and "versions.json cannot be read" in text and "resuming after 0 steps" in text
     assert_same_run(copy, whole)
+
+
+def test_a_checkpoint_from_before_a_task_told_more_is_still_good(whole: pathlib.Path):
+    state = experiment.load_run(whole)[1]
+    packed = checkpoint.pack(state)
+    (told,) = [path for path in packed if ".env.info[" in path]
+    older = {path: x for path, x in packed.items() if path != told}
+    after = checkpoint.pack(checkpoint.unpack(older | {told.replace("position", "forgotten"): packed[told]}, state))
+    assert after.keys() == packed.keys() and not after[told].any()
+    assert all(np.array_equal(after[path], x) for path, x in older.items())
+    with pytest.raises(UsageError, match="another kind of run: it differs in .*multiplier"):
+        checkpoint.unpack({path: x for path, x in packed.items() if "multiplier" not in path}, state)
 
 
 def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli):
