@@ -32,7 +32,7 @@ from pmt_jax.compiling import compile_run
 from pmt_jax.config import Config
 from pmt_jax.devices import make_mesh
 from pmt_jax.folder import MATMUL_PRECISION
-from pmt_jax.run import setup
+from pmt_jax.run import Run, setup
 
 from . import records, turns
 from .tables import scaling as table
@@ -57,15 +57,18 @@ class Contestant(turns.Contestant):
         return config.seeds * config.batch_size * config.log_interval / statistics.median(self.seconds[1:])
 
 
-def enter(task: str, scaling: str, count: int, sizes: dict[str, Any], method: str) -> Contestant:
-    """Compiles a task's training loop for `count` devices."""
-    config = load_config(task, method=method, **sizes)
-    run = dataclasses.replace(setup(config), mesh=make_mesh(config, count))
+def prepare(config: Config, count: int) -> Run:
+    """A run over `count` devices."""
+    return dataclasses.replace(setup(config), mesh=make_mesh(config, count))
+
+
+def enter(run: Run, scaling: str, count: int) -> Contestant:
+    """Compiles the training loop of a run over `count` devices."""
     begin = time.perf_counter()
     state, programs = compile_run(run, lambda _: None)
     seconds = time.perf_counter() - begin
-    print(f"compiled {task}, {scaling}, {count} device(s) in {seconds:.1f} s", flush=True)
-    return Contestant(state, programs.chunk, seconds, scaling, count, config, run.vector.env.engine)
+    print(f"compiled {run.config.task}, {scaling}, {count} device(s) in {seconds:.1f} s", flush=True)
+    return Contestant(state, programs.chunk, seconds, scaling, count, run.config, run.vector.env.engine)
 
 
 def measure(task: str, size: tuple[int, int], counts: list[int], arguments: argparse.Namespace) -> records.Rows:
@@ -79,8 +82,10 @@ def measure(task: str, size: tuple[int, int], counts: list[int], arguments: argp
             ("weak, seeds", count, one | {"seeds": count}),
             ("strong", count, one),
         ]
+    # One after the other: Warp starts up with the first engine, and two threads that start it crash it.
+    runs = [prepare(load_config(task, method=arguments.method, **sizes), count) for _, count, sizes in splits]
     with concurrent.futures.ThreadPoolExecutor() as pool:  # compiling is most of the time that a rented host is held
-        begun = [pool.submit(enter, task, scaling, count, sizes, arguments.method) for scaling, count, sizes in splits]
+        begun = [pool.submit(enter, run, *split[:2]) for run, split in zip(runs, splits, strict=True)]
         contestants = [future.result() for future in begun]
     for _ in range(arguments.repeats + 1):
         for contestant in contestants:

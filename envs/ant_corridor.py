@@ -261,7 +261,7 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _place(torso: jax.Array) -> dict[str, jax.Array]:
-    """How far the ant is along x (m), and 1 where it is `outside`: walls do not block, and past their bands nothing costs."""
+    """How far the ant is along x (m), and 1 where it is outside: walls do not block, nor is it costly behind them."""
     outside = jnp.abs(off_centre(torso[0], torso[1])) > HALF_WIDTH
     return {"x_position": torso[0], "outside": outside.astype(torso.dtype)}
 

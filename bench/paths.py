@@ -1,0 +1,100 @@
+"""Where ants go: paths through the corridor of a few episodes of each policy, and a picture of them.
+
+    python -m bench.paths runs/ant hub:ant_2x4/r4sg --json bench/results/ant_paths.json --png docs/ant_paths.png
+    python -m bench.paths --from bench/results/ant_paths.json --png docs/ant_paths.png
+
+Every episode is the seed's `last` policy from one of the fixed starts of evaluations, actions sampled. A run's first
+seed is shown; `NAME=FOLDER` gives a policy a title, `FOLDER@3` takes seed 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from envs import ant_corridor
+from pmt_jax.compiling import use_cache
+from pmt_jax.episode import record_run
+from pmt_jax.errors import UsageError
+
+EPISODES = 8
+EVERY = 5  # control steps between two points of a path
+
+
+def paths(source: str, episodes: int) -> dict[str, Any]:
+    """A policy's episodes: title, and for each its path [points] of x and y in m, its reward and its cost.
+
+    Raises:
+      UsageError: there is no such run, or it is not an ant's.
+    """
+    title, _, place = source.rpartition("=")
+    place, _, seed = place.partition("@")
+    found = []
+    for number in range(episodes):
+        episode = record_run(pathlib.Path(place), int(seed) if seed else None, number)  # hub:... survives a Path
+        if "torso_xpos" not in episode.raw:
+            raise UsageError(f"{place} is a run of {episode.env.spec.name}; paths are drawn of ants only")
+        x, y, _ = np.asarray(episode.raw["torso_xpos"])[::EVERY].round(2).T
+        found.append(
+            {
+                "x": x.tolist(),
+                "y": y.tolist(),
+                "reward": round(float(episode.reward_sum[-1]), 1),
+                "cost": round(float(episode.cost_sum[-1]), 1),
+            }
+        )
+    return {"title": title or place, "episodes": found}
+
+
+def draw(policies: list[dict[str, Any]], file: pathlib.Path) -> None:
+    """One panel a policy: the corridor, its danger bands, and the paths."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 2.4 * len(policies)), layout="constrained")
+    panels = figure.subplots(len(policies), squeeze=False, sharex=True)[:, 0]
+    furthest = min(140.0, max(max(e["x"]) for policy in policies for e in policy["episodes"]) + 5)
+    x = np.linspace(-5, furthest, 500)
+    centre = -np.asarray(ant_corridor.off_centre(jnp.asarray(x), jnp.zeros(x.shape)))
+    for panel, policy in zip(panels, policies, strict=True):
+        for side in (-1, 1):
+            wall = centre + side * ant_corridor.HALF_WIDTH
+            panel.fill_between(x, wall - ant_corridor.DANGER, wall + ant_corridor.DANGER, color="#f3c6c0", lw=0)
+            panel.plot(x, wall, color="#a33", lw=1)
+        for episode in policy["episodes"]:
+            panel.plot(episode["x"], episode["y"], color="#25557f", lw=0.9, alpha=0.8)
+        reward, cost = (np.mean([e[name] for e in policy["episodes"]]) for name in ("reward", "cost"))
+        panel.set_title(f"{policy['title']}: reward {reward:,.0f}, cost {cost:.1f}", loc="left", fontsize=10)
+        panel.set(ylabel="y (m)", ylim=(-25, 30), xlim=(-5, furthest))
+    panels[-1].set_xlabel("x (m)")
+    figure.savefig(file, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policies", nargs="*", metavar="[TITLE=]FOLDER[@SEED]")
+    parser.add_argument("--from", dest="stored", type=pathlib.Path, metavar="JSON", help="paths stored before")
+    parser.add_argument("--episodes", type=int, default=EPISODES)
+    parser.add_argument("--json", type=pathlib.Path)
+    parser.add_argument("--png", type=pathlib.Path)
+    arguments = parser.parse_args()
+    use_cache()
+    try:
+        found = json.loads(arguments.stored.read_text()) if arguments.stored else []
+        found += [paths(source, arguments.episodes) for source in arguments.policies]
+    except (OSError, ValueError, UsageError) as error:
+        parser.error(str(error))
+    if not found:
+        parser.error("whose paths? name run folders, pretrained policies, or a file with --from")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(found) + "\n")
+    if arguments.png:
+        draw(found, arguments.png)
+
+
+if __name__ == "__main__":
+    main()
