@@ -22,8 +22,8 @@ from pmt_jax.compiling import use_cache
 from pmt_jax.episode import record_run
 from pmt_jax.errors import UsageError
 
-EPISODES = 8
-EVERY = 5  # control steps between two points of a path
+EPISODES = 6
+EVERY = 10  # control steps between two points of a path
 
 
 def paths(source: str, episodes: int) -> dict[str, Any]:
