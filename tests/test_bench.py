@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import pathlib
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from bench import compare, curves, records, render, suite, tables
+from bench import compare, curves, paths, records, render, suite, tables
 from bench.__main__ import main
 from pmt_jax import table
 
@@ -142,6 +144,34 @@ def test_rendering_replaces_blocks_and_nothing_else():
     for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
         with pytest.raises(compare.UsageError):
             render.render(broken, reports)
+
+
+def test_paths_of_ants_are_stored_and_drawn(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def record(folder: pathlib.Path, seed: int | None, number: int) -> SimpleNamespace:
+        asked.append((str(folder), seed, number))
+        walk = np.stack([np.arange(31.0), 2 * np.arange(31.0), np.ones(31)], axis=1)
+        raw = {"torso_xpos": walk} if folder.name != "lane" else {}
+        spec = SimpleNamespace(spec=SimpleNamespace(name="lane"))
+        return SimpleNamespace(raw=raw, env=spec, reward_sum=np.array([1.0, 5.0]), cost_sum=np.array([0.0, 2.0]))
+
+    monkeypatch.setattr(paths, "record_run", record)
+    stored, drawn = tmp_path / "paths.json", tmp_path / "paths.png"
+    command = ["bench.paths", "Who turns=runs/x@3", "hub:ant_2x4/r4sg", "--episodes", "2", "--json", str(stored)]
+    monkeypatch.setattr("sys.argv", command)
+    paths.main()
+    assert asked == [("runs/x", 3, 0), ("runs/x", 3, 1), ("hub:ant_2x4/r4sg", None, 0), ("hub:ant_2x4/r4sg", None, 1)]
+    first, second = json.loads(stored.read_text())
+    assert (first["title"], second["title"]) == ("Who turns", "hub:ant_2x4/r4sg")
+    assert first["episodes"][0] == {"x": [0, 10, 20, 30], "y": [0, 20, 40, 60], "reward": 5.0, "cost": 2.0}
+    monkeypatch.setattr("sys.argv", ["bench.paths", "--from", str(stored), "--png", str(drawn)])
+    paths.main()
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    for mistake in (["runs/lane"], []):
+        monkeypatch.setattr("sys.argv", ["bench.paths", *mistake])
+        with pytest.raises(SystemExit, match="2"):
+            paths.main()
 
 
 def test_a_block_of_curves_is_the_table_of_their_runs(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
