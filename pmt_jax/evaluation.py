@@ -91,7 +91,7 @@ def interval(x: np.ndarray) -> tuple[float, float]:
 
 
 def improves(
-    reward: np.ndarray, cost: np.ndarray, best_reward: np.ndarray, best_cost: np.ndarray, limit: float
+    reward: np.ndarray, cost: np.ndarray, best_reward: np.ndarray, best_cost: np.ndarray, limit: float | np.ndarray
 ) -> np.ndarray:
     """Whether a policy is better than the best so far: [...] bool, of mean episode rewards and costs [...].
 

@@ -247,13 +247,13 @@ def _rows(run: Run, step: int, metrics: dict[str, np.ndarray]) -> list[dict[str,
     """A chunk's metrics as one row per seed: counts are summed over the chunk, the rest averaged, nan left out."""
     config = run.config
     rows = []
-    for i in range(config.seeds):
+    for i, limit in enumerate(run.cost_limits):
         row: dict[str, Any] = {
             "step": step,
             "seed": config.seed + i,
             "task": run.vector.spec.name,
             "method": config.method,
-            "cost_limit": run.cost_limit,
+            "cost_limit": float(limit),
         }
         for name, values in metrics.items():
             row[name] = _reduce(name, np.asarray(values[i]))
@@ -328,7 +328,7 @@ def _keep_best(run: Run, programs: Programs, best: Best, state: LearnerState, ro
         np.asarray([row[prefix + f] for row in rows], np.float32) for f in ("episode_reward", "episode_cost")
     )
     old_reward, old_cost = np.asarray(best.reward), np.asarray(best.cost)
-    improved = improves(reward, cost, old_reward, old_cost, run.cost_limit)
+    improved = improves(reward, cost, old_reward, old_cost, run.cost_limits)
     if not improved.any():
         return best
     return Best(

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from . import networks, normalise, tasks
 from .config import HYPER_FIELDS, Config, Hyper
@@ -47,6 +48,12 @@ class Run:
         """Allowed undiscounted cost of one agent per episode: the config's, or the task's where that is left open."""
         limit = self.config.cost_limit
         return self.vector.spec.cost_limit if math.isnan(limit) else limit
+
+    @property
+    def cost_limits(self) -> np.ndarray:
+        """`cost_limit` of everything that trains side by side: [config.seeds]."""
+        limits = self.lanes.hyper.cost_limit if self.lanes else self.cost_limit
+        return np.broadcast_to(np.asarray(limits), self.config.seeds)
 
     def scale(self, moments: Moments, x: jax.Array) -> jax.Array:
         """Observations or states as the networks see them: scaled by running `moments` if the config says so."""

@@ -225,7 +225,7 @@ class Progress:
             f"{step:,}",
             self._number("episode_reward", ".1f"),
             self._number("episode_cost", ".2f"),
-            f"{rows[0]['cost_limit']:g}",
+            ", ".join(f"{limit:g}" for limit in dict.fromkeys(row["cost_limit"] for row in rows)),
             self._number("violation_rate", ".2%"),
             self._number("lambda", ".3f"),
             f"{rate:,.0f}",

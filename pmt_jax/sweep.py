@@ -30,9 +30,6 @@ from .tasks import did_you_mean, names
 
 Points = dict[str, Config]  # by the name of the point's folder
 
-# The cost limit is traced too, but what is written about a run is written for one limit.
-TRACED = tuple(name for name in HYPER_FIELDS if name != "cost_limit")
-
 
 class Launch(NamedTuple):
     """How programs are trained.
@@ -214,7 +211,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
     last = max((int(p.name.split("-")[1]) for p in begun), default=0)
     alike: dict[str, Points] = {}
     for name, config in sorted(left.items()):
-        traced = {f: getattr(Config, f) for f in (*TRACED, "seed")}
+        traced = {f: getattr(Config, f) for f in (*HYPER_FIELDS, "seed")}
         alike.setdefault(repr(dataclasses.replace(config, **traced)), {})[name] = config
     for number, group in enumerate(alike.values(), last + 1):
         yield out / f".group-{number}", group
@@ -245,14 +242,17 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
 
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
-    _, step, saved = load_saved(folder / "run")
+    run, step, saved = load_saved(folder / "run")
     rows = read_rows(folder / "run" / "metrics.jsonl")
     for number, (name, config) in enumerate(group.items()):
         if (out / name).exists():
             continue
-        first = number * config.seeds  # of its lanes
+        first = number * config.seeds  # of its lanes, whose rows know a rounded limit
+        limit = dataclasses.replace(run, config=config).cost_limit
         mine = [
-            row | {"seed": row["seed"] - first + config.seed} for row in rows if 0 <= row["seed"] - first < config.seeds
+            row | {"seed": row["seed"] - first + config.seed, "cost_limit": limit}
+            for row in rows
+            if 0 <= row["seed"] - first < config.seeds
         ]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)

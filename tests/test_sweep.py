@@ -13,6 +13,7 @@ import pytest
 from pmt_jax import checkpoint, experiment, load_config, sweep, table
 from pmt_jax.config import to_toml
 from pmt_jax.errors import UsageError
+from pmt_jax.folder import load_saved
 from pmt_jax.sinks import Jsonl
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
@@ -125,13 +126,26 @@ def test_killed_while_the_points_are_written(swept: pathlib.Path, tmp_path: path
     assert without_seconds(rows(tmp_path / NAMES[1])) == without_seconds(rows(swept / NAMES[1]))
 
 
+def test_points_of_one_program_keep_to_their_own_limits(tmp_path: pathlib.Path, cli):
+    """What a row says, what the multiplier answers to, and which policy is the best so far."""
+    small = ("--num-envs", 8, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--steps", 4000)
+    limits = ("--set", "cost_limit=0.2,50", "--lambda-lr", 1)
+    assert cli("sweep", "lane", *small, *limits, "--method", "mappo_l", "--no-cache", "--out", tmp_path)[0] == 0
+    strict, loose = (tmp_path / f"cost_limit={limit}" for limit in ("0.2", "50"))
+    assert {row["cost_limit"] for row in rows(strict)} == {0.2} and {row["cost_limit"] for row in rows(loose)} == {50}
+    assert rows(strict)[-1]["lambda"] > rows(loose)[-1]["lambda"]
+    for point, limit in ((strict, 0.2), (loose, 50)):
+        within = [row["episode_reward"] for row in rows(point) if row["episode_cost"] <= limit]
+        np.testing.assert_allclose(load_saved(point)[2]["best"].reward, [max(within)], rtol=1e-6)
+
+
 def test_what_is_traced_shares_a_program_and_what_is_static_does_not(tmp_path: pathlib.Path):
     vary = {"method": ["happo", "f4sg"], "lambda_lr": ["0.1", "0.30"], "cost_limit": ["1", "2"], "seed": ["0", "5"]}
     points = sweep.grid("lane", vary)
     assert len(points) == 16 and "method=f4sg,lambda_lr=0.3,cost_limit=2,seed=5" in points
     groups = [list(group.values()) for _, group in sweep._groups(points, points, tmp_path)]
-    assert [len(group) for group in groups] == [4, 4, 4, 4]
-    assert all(len({(c.method, c.cost_limit) for c in group}) == 1 for group in groups)
+    assert [len(group) for group in groups] == [8, 8]
+    assert all(len({c.method for c in group}) == 1 for group in groups)
 
 
 @pytest.mark.parametrize(
