@@ -32,7 +32,9 @@ def paths(source: str, episodes: int) -> dict[str, Any]:
     Raises:
       UsageError: there is no such run, or it is not an ant's.
     """
-    title, _, place = source.rpartition("=")
+    title, place = "", source
+    if not pathlib.Path(source.partition("@")[0]).exists() and "=" in source:  # a sweep's folders have an = themselves
+        title, _, place = source.partition("=")
     place, _, seed = place.partition("@")
     found = []
     for number in range(episodes):

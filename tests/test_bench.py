@@ -158,12 +158,15 @@ def test_paths_of_ants_are_stored_and_drawn(tmp_path: pathlib.Path, monkeypatch:
 
     monkeypatch.setattr(paths, "record_run", record)
     stored, drawn = tmp_path / "paths.json", tmp_path / "paths.png"
-    command = ["bench.paths", "Who turns=runs/x@3", "hub:ant_2x4/r4sg", "--episodes", "2", "--json", str(stored)]
-    monkeypatch.setattr("sys.argv", command)
+    point = tmp_path / "method=r4sg"  # as a sweep names its folders
+    point.mkdir()
+    wanted = ["Who turns=runs/x@3", "hub:ant_2x4/r4sg", f"{point}@1", f"R4SG={point}"]
+    monkeypatch.setattr("sys.argv", ["bench.paths", *wanted, "--episodes", "2", "--json", str(stored)])
     paths.main()
-    assert asked == [("runs/x", 3, 0), ("runs/x", 3, 1), ("hub:ant_2x4/r4sg", None, 0), ("hub:ant_2x4/r4sg", None, 1)]
-    first, second = json.loads(stored.read_text())
-    assert (first["title"], second["title"]) == ("Who turns", "hub:ant_2x4/r4sg")
+    places = [("runs/x", 3), ("hub:ant_2x4/r4sg", None), (str(point), 1), (str(point), None)]
+    assert asked == [(*place, number) for place in places for number in (0, 1)]
+    first, *others = json.loads(stored.read_text())
+    assert [first["title"], *(p["title"] for p in others)] == ["Who turns", "hub:ant_2x4/r4sg", str(point), "R4SG"]
     assert first["episodes"][0] == {"x": [0, 10, 20, 30], "y": [0, 20, 40, 60], "reward": 5.0, "cost": 2.0}
     monkeypatch.setattr("sys.argv", ["bench.paths", "--from", str(stored), "--png", str(drawn)])
     paths.main()
