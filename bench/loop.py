@@ -31,7 +31,7 @@ from pmt_jax.run import setup
 from . import records, turns
 
 GPU_SIZE, CPU_SIZE = "5x2048x8", "1x64x64"
-PAPER = ["ant_2x4:mappo_l:1x128x64", "ant_2x4:mappo_l:5x128x64"]  # rollouts as long as in Table 1
+PAPER = ["ant_2x4:mappo_l:1x384x32", "ant_2x4:mappo_l:5x384x32"]  # sizes of Table 1
 
 
 def measure(case: str, updates: int, repeats: int, fixed: dict[str, Any]) -> dict[str, Any]:
