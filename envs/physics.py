@@ -503,10 +503,13 @@ class WarpEngine:
         mjx = import_mjx()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
-        settings: dict[str, Any] = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
-        if _needs_post_constraint(readout):
-            settings["opt._impl.run_rne_postconstraint"] = True
+        settings = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
+        settings |= {"ncam": 0, "nlight": 0}  # nobody looks through them here, and each has a kernel a stage
         self._model = _constant(lambda: mjx.put_model(model, impl="warp").tree_replace(settings))
+        # Forces after the constraints are read at the end of a control step; Warp would work them out in each of the
+        # integrator's stages of every substep, a twentieth of which are the ant's last.
+        forces = {"opt._impl.run_rne_postconstraint": _needs_post_constraint(readout)}
+        self._last_model = self._model.tree_replace(forces)
 
     def start(self) -> PhysicsState:
         return _start(self._c_model)
@@ -526,8 +529,9 @@ class WarpEngine:
 
         def one(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
             own = _loaded(data, state, ctrl)
-            for _ in range(self._substeps):
+            for _ in range(self._substeps - 1):
                 own = mjx.step(self._model, own)
+            own = mjx.step(self._last_model, own)
             after, out = _unloaded(own, self._readout)
             lost = (own._impl.overflow & _LOST) != 0
             return after, out | {"overflow": lost.astype(after.qpos.dtype)}
