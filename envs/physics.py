@@ -506,8 +506,8 @@ class WarpEngine:
         settings = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
         settings |= {"ncam": 0, "nlight": 0}  # nobody looks through them here, and each has a kernel a stage
         self._model = _constant(lambda: mjx.put_model(model, impl="warp").tree_replace(settings))
-        # Forces after the constraints are read at the end of a control step; Warp would work them out in each of the
-        # integrator's stages of every substep, a twentieth of which are the ant's last.
+        # Forces after the constraints are read at the end of a control step only; Warp works them out in each of the
+        # integrator's stages, so the substeps before the last go without.
         forces = {"opt._impl.run_rne_postconstraint": _needs_post_constraint(readout)}
         self._last_model = self._model.tree_replace(forces)
 

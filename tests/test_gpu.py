@@ -43,7 +43,7 @@ def test_warp_repeats_the_recorded_transitions():
     assert np.median(error) < 1e-6 and np.quantile(error, 0.9) < 5e-3
     assert (np.asarray(after.terminated) == rows["done"]).mean() > 0.99
     assert (np.asarray(after.info["cost_obj"]) == rows["cost_obj"]).mean() > 0.99
-    # Of forces that the engine works out once a control step; some rows have another contact frame, as above.
+    # Of forces that the engine works out in the last substep; some rows have another contact frame, as above.
     error = np.abs(np.asarray(after.info["reward_contact"]) - rows["reward_contact"])
     assert (rows["reward_contact"] < 0).any() and np.quantile(error, 0.8) < 1e-6
 
