@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from pmt_jax.cli import answer, refuse_unknown
+from pmt_jax.cli.main import answer, refuse_unknown
 from pmt_jax.errors import UsageError
 
 from . import compare, render, suite

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.hand_over import HORIZON, HandOver
+from envs.hands.hand_over import HORIZON, HandOver
 
 MOMENTS = (0, 6, 12, 18, 24, 32, 44)  # control steps at which the targets are free; held after the last
 SMALLEST = 0.03  # deviation that the search keeps, in units of the action

@@ -21,9 +21,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from pmt_jax import checkpoint, experiment, folder, load_config
-from pmt_jax.compiling import compile_run, use_cache
-from pmt_jax.run import setup
+from pmt_jax import load_config
+from pmt_jax.learning.setup import make_setup
+from pmt_jax.training import checkpoint, run_folder, trainer
+from pmt_jax.training.compile import compile_run, use_cache
 
 from . import records
 
@@ -36,9 +37,9 @@ def seconds(work: Callable[[], Any]) -> float:
 
 def measure(chunks: int, repeats: int) -> dict[str, Any]:
     """All figures; seconds are medians, except for the first save, which also warms orbax up."""
-    run = setup(load_config("ant_2x4", method="mixed", num_envs=256))
+    run = make_setup(load_config("ant_2x4", method="mixed", num_envs=256))
     state, programs = compile_run(run, print)
-    best = folder.first_best(state)
+    best = run_folder.initial_best(state)
     chunk_seconds = []
     for _ in range(chunks):
         begin = time.perf_counter()
@@ -47,7 +48,7 @@ def measure(chunks: int, repeats: int) -> dict[str, Any]:
     keep_seconds = []
     for _ in range(chunks):
         begin = time.perf_counter()
-        best = folder.Best(programs.take(np.ones(1, bool), best.state, state), best.reward, best.cost)
+        best = run_folder.Best(programs.take(np.ones(1, bool), best.state, state), best.reward, best.cost)
         jax.block_until_ready(best.state)
         keep_seconds.append(time.perf_counter() - begin)
     saved = {"last": state, "best": best}
@@ -69,8 +70,8 @@ def measure(chunks: int, repeats: int) -> dict[str, Any]:
         "load_seconds": round(statistics.median(load_seconds), 3),
         "chunk_seconds": round(chunk, 3),
         "keep_best_seconds": round(keep, 5),
-        "overhead": round(save / experiment.CHECKPOINT_SECONDS + keep / chunk, 5),
-        "interval": experiment.CHECKPOINT_SECONDS,
+        "overhead": round(save / trainer.CHECKPOINT_SECONDS + keep / chunk, 5),
+        "interval": trainer.CHECKPOINT_SECONDS,
     }
 
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from pmt_jax import report, table
 from pmt_jax.errors import UsageError
+from pmt_jax.studies import plot, table
 
 FIGURES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
 
@@ -26,9 +26,9 @@ FIGURES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episod
 def compact(folder: pathlib.Path) -> dict[str, Any]:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
-    Curves are {name: [seeds][points]}, None where unknown; `table` is {column: [seeds]}, see `pmt_jax.table`.
+    Curves are {name: [seeds][points]}, None where unknown; `table` is {column: [seeds]}, see `pmt_jax.studies.table`.
     """
-    curves, (row,) = report.read(folder, FIGURES), table.rows([folder])
+    curves, (row,) = plot.read(folder, FIGURES), table.rows([folder])
     figures = {name: [[_rounded(x) for x in seed] for seed in curves.figures[name]] for name in FIGURES}
     return {
         "steps": curves.steps.tolist(),
@@ -49,9 +49,9 @@ def _rounded(x: float) -> float | None:
     return float(f"{x:.6g}") if np.isfinite(x) else None
 
 
-def curves(stored: dict[str, Any]) -> report.Curves:
+def curves(stored: dict[str, Any]) -> plot.Curves:
     """The inverse of `compact`."""
-    return report.Curves(
+    return plot.Curves(
         names=(stored["task"],),
         task=stored["task"],
         method=stored["method"],
@@ -94,7 +94,7 @@ def main() -> None:
     if arguments.json:
         arguments.json.write_text(json.dumps(runs) + "\n")
     if arguments.png:
-        report.draw([curves(run) for run in runs], arguments.png)
+        plot.draw([curves(run) for run in runs], arguments.png)
 
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs import power_flow
 from envs.vector import VectorEnv
+from envs.voltage import power_flow
 from pmt_jax.errors import UsageError, optional
 
 from . import records

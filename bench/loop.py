@@ -24,9 +24,9 @@ from typing import Any
 import jax
 
 from pmt_jax import METHODS, load_config
-from pmt_jax.compiling import compile_run
-from pmt_jax.folder import MATMUL_PRECISION
-from pmt_jax.run import setup
+from pmt_jax.learning.setup import make_setup
+from pmt_jax.training.compile import compile_run
+from pmt_jax.training.run_folder import MATMUL_PRECISION
 
 from . import records, turns
 
@@ -39,7 +39,7 @@ def measure(case: str, updates: int, repeats: int, fixed: dict[str, Any]) -> dic
     task, method, size = case.split(":")
     seeds, num_envs, length = (int(x) for x in size.split("x"))
     sizes = {"seeds": seeds, "num_envs": num_envs, "rollout_length": length, "log_interval": updates}
-    run = setup(load_config(task, method=method, **sizes, **fixed))
+    run = make_setup(load_config(task, method=method, **sizes, **fixed))
     begin = time.perf_counter()
     state, programs = compile_run(run, lambda _: None)
     contestant = turns.Contestant(state, programs.chunk, time.perf_counter() - begin)

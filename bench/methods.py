@@ -18,7 +18,8 @@ from typing import Any
 
 import jax
 
-from pmt_jax import METHODS, learner, load_config, setup
+from pmt_jax import METHODS, load_config, make_setup
+from pmt_jax.learning import learner
 
 from . import records, turns
 from .tables import of_methods
@@ -38,7 +39,7 @@ class Contestant(turns.Contestant):
 
 def enter(task: str, method: str) -> Contestant:
     """Compiles one update of a method on a task."""
-    run = setup(load_config(task, method=method, **TASKS[task]))
+    run = make_setup(load_config(task, method=method, **TASKS[task]))
     state = jax.jit(lambda key: learner.init(run, run.hyper, key))(jax.random.key(0))
     begin = time.perf_counter()
     update = jax.jit(lambda s: learner.train_chunk(run, run.hyper, s, 1)).lower(state).compile()

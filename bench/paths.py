@@ -17,10 +17,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from envs import ant_corridor
-from pmt_jax.compiling import use_cache
-from pmt_jax.episode import record_run
+from envs.ant import corridor
 from pmt_jax.errors import UsageError
+from pmt_jax.render.episode import record_run
+from pmt_jax.training.compile import use_cache
 
 EPISODES = 6
 EVERY = 10  # control steps between two points of a path
@@ -61,11 +61,11 @@ def draw(policies: list[dict[str, Any]], file: pathlib.Path) -> None:
     panels = figure.subplots(len(policies), squeeze=False, sharex=True)[:, 0]
     furthest = min(140.0, max(max(e["x"]) for policy in policies for e in policy["episodes"]) + 5)
     x = np.linspace(-5, furthest, 500)
-    centre = -np.asarray(ant_corridor.off_centre(jnp.asarray(x), jnp.zeros(x.shape)))
+    centre = -np.asarray(corridor.off_centre(jnp.asarray(x), jnp.zeros(x.shape)))
     for panel, policy in zip(panels, policies, strict=True):
         for side in (-1, 1):
-            wall = centre + side * ant_corridor.HALF_WIDTH
-            panel.fill_between(x, wall - ant_corridor.DANGER, wall + ant_corridor.DANGER, color="#f3c6c0", lw=0)
+            wall = centre + side * corridor.HALF_WIDTH
+            panel.fill_between(x, wall - corridor.DANGER, wall + corridor.DANGER, color="#f3c6c0", lw=0)
             panel.plot(x, wall, color="#a33", lw=1)
         for episode in policy["episodes"]:
             panel.plot(episode["x"], episode["y"], color="#25557f", lw=0.9, alpha=0.8)

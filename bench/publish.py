@@ -20,14 +20,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pmt_jax import pretrained, rollout, tasks
-from pmt_jax.compiling import use_cache
+from pmt_jax import tasks
 from pmt_jax.errors import UsageError
-from pmt_jax.evaluation import improves
-from pmt_jax.experiment import evaluate_states
-from pmt_jax.folder import WHICH, load_saved
-from pmt_jax.run import Run
-from pmt_jax.types import ActingState, Trained
+from pmt_jax.learning import rollout
+from pmt_jax.learning.evaluation import is_better
+from pmt_jax.learning.setup import Setup
+from pmt_jax.learning.types import ActingState, TrainState
+from pmt_jax.policies import hub
+from pmt_jax.policies.evaluate import evaluate_states
+from pmt_jax.policies.load import WHICH
+from pmt_jax.training.compile import use_cache
+from pmt_jax.training.run_folder import load_saved
 
 from . import records, render
 
@@ -42,7 +45,7 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
     config = run.config
     if config.task not in tasks.names():
         raise UsageError(f"{folder} is of a task of your own, which the package does not have; use pmt export")
-    packed = pretrained.rounded(state)
+    packed = hub.rounded(state)
     facts = {
         "task": config.task,
         "method": config.method,
@@ -57,11 +60,11 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
         "action_change": action_change(run, packed, state),
         "training": json.loads((folder / "versions.json").read_text()),
     }
-    pretrained.save(f"{pretrained.PREFIX}{config.task}/{config.method}", config, state, facts)
+    hub.save(f"{hub.PREFIX}{config.task}/{config.method}", config, state, facts)
     return facts
 
 
-def choose(folder: pathlib.Path, episodes: int) -> tuple[Run, str, dict[str, Any], ActingState]:
+def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, Any], ActingState]:
     """The best of all seeds, last and best, of a run.
 
     Returns:
@@ -69,7 +72,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Run, str, dict[str, Any
     """
     run, _, saved = load_saved(folder, "auto")
     states = [saved["last"], saved["best"].state]
-    acting = [ActingState(Trained(state.actor.params, None), state.obs_moments, state.update) for state in states]
+    acting = [ActingState(TrainState(state.actor.params, None), state.obs_moments, state.update) for state in states]
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
     rows = evaluate_states(run, both, episodes, deterministic=True)
     reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
@@ -77,7 +80,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Run, str, dict[str, Any
     limit = np.inf if run.method.constraint == "none" else run.cost_limit
     chosen, reached = None, (np.array(-np.inf), np.array(np.inf))
     for i, new in enumerate(zip(reward, cost, strict=True)):
-        if improves(*new, *reached, limit):
+        if is_better(*new, *reached, limit):
             chosen, reached = i, new
     if chosen is None:
         raise UsageError(f"no policy in {folder} has figures that are numbers")
@@ -91,7 +94,7 @@ def figures(row: dict[str, Any]) -> dict[str, list[float]]:
     return {name: [round(float(x), 6) for x in pair] for name, pair in row.items() if isinstance(pair, tuple)}
 
 
-def action_change(run: Run, packed: ActingState, original: ActingState, environments: int = 8) -> float:
+def action_change(run: Setup, packed: ActingState, original: ActingState, environments: int = 8) -> float:
     """How far packing moves the mean action, in the action's unit, mean over the entries that an agent has.
 
     Taken in the states of one episode of the packed policy, actions sampled, in each of a few environments.
@@ -112,10 +115,7 @@ def action_change(run: Run, packed: ActingState, original: ActingState, environm
 
 def rows() -> records.Rows:
     """What is told about every pretrained policy, and its size in bytes."""
-    return [
-        {"name": name, "bytes": pretrained.file_of(name).stat().st_size, **pretrained.about(name)}
-        for name in pretrained.names()
-    ]
+    return [{"name": name, "bytes": hub.file_of(name).stat().st_size, **hub.about(name)} for name in hub.names()]
 
 
 def main() -> None:

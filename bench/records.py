@@ -14,9 +14,9 @@ from typing import Any
 
 import jax
 
-from envs.physics import usable_cpus
+from envs.physics.engines import usable_cpus
 from pmt_jax.files import replace_text
-from pmt_jax.folder import version
+from pmt_jax.training.run_folder import version
 
 Rows = list[dict[str, Any]]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pmt_jax import load_config, setup
+from pmt_jax import load_config, make_setup
 
 from . import records
 from .search import search
@@ -43,7 +43,7 @@ def measure(task: str, method: str, changes: dict[str, Any], faster: tuple[float
     config = load_config(task, method=method, seeds=SEEDS, **changes)
     rates = [config.lambda_lr * times for times in faster]
     found = search({f"lambda_lr={rate:g}": config.replace(lambda_lr=rate) for rate in rates}, episodes=0)
-    horizon = setup(config).vector.horizon
+    horizon = make_setup(config).vector.horizon
     costly = horizon * np.asarray(found["curves"]["violation_rate"], float)
     reward = horizon * np.asarray(found["curves"]["step_reward"], float)
     last = max(1, len(costly) // 8)

@@ -27,12 +27,13 @@ from typing import Any
 
 import jax
 
-from pmt_jax import load_config, processes
-from pmt_jax.compiling import compile_run
-from pmt_jax.config import Config
-from pmt_jax.devices import make_mesh
-from pmt_jax.folder import MATMUL_PRECISION
-from pmt_jax.run import Run, setup
+from pmt_jax import load_config
+from pmt_jax.config.settings import Config
+from pmt_jax.learning.setup import Setup, make_setup
+from pmt_jax.learning.sharding import make_mesh
+from pmt_jax.training import processes
+from pmt_jax.training.compile import compile_run
+from pmt_jax.training.run_folder import MATMUL_PRECISION
 
 from . import records, turns
 from .tables import scaling as table
@@ -57,12 +58,12 @@ class Contestant(turns.Contestant):
         return config.seeds * config.batch_size * config.log_interval / statistics.median(self.seconds[1:])
 
 
-def prepare(config: Config, count: int) -> Run:
+def prepare(config: Config, count: int) -> Setup:
     """A run over `count` devices."""
-    return dataclasses.replace(setup(config), mesh=make_mesh(config, count))
+    return dataclasses.replace(make_setup(config), mesh=make_mesh(config, count))
 
 
-def enter(run: Run, scaling: str, count: int) -> Contestant:
+def enter(run: Setup, scaling: str, count: int) -> Contestant:
     """Compiles the training loop of a run over `count` devices."""
     begin = time.perf_counter()
     state, programs = compile_run(run, lambda _: None)

@@ -22,8 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pmt_jax import Config, evaluate, load_config, setup, sweep
-from pmt_jax.experiment import load_run
+from pmt_jax import Config, evaluate, load_config, make_setup
+from pmt_jax.policies.load import load_run
+from pmt_jax.studies import sweep
 
 Ranges = dict[str, tuple[float, float]]  # name -> (lowest, highest)
 
@@ -52,12 +53,12 @@ def search(points: sweep.Points, episodes: int) -> dict[str, Any]:
             raise SystemExit(130)
         runs = [load_run(out / name) for name in points]
         logs = [[json.loads(line) for line in (out / name / "metrics.jsonl").open()] for name in points]
-    lanes = [[row for row in log if row["seed"] == seed] for log in logs for seed in sorted({r["seed"] for r in log})]
-    first = lanes[0]
+    trials = [[row for row in log if row["seed"] == seed] for log in logs for seed in sorted({r["seed"] for r in log})]
+    first = trials[0]
     steps, seconds = ([row[name] for row in first] for name in ("step", "seconds"))
-    rate = len(lanes) * (steps[-1] - steps[0]) / max(seconds[-1] - seconds[0], 1e-9)
+    rate = len(trials) * (steps[-1] - steps[0]) / max(seconds[-1] - seconds[0], 1e-9)
     names = [name for name in first[0] if name in CURVE or name.startswith(("info/", "fear/", "regret/"))]
-    curves = {name: [[lane[i][name] for lane in lanes] for i in range(len(first))] for name in names}
+    curves = {name: [[lane[i][name] for lane in trials] for i in range(len(first))] for name in names}
     found = {"steps": steps, "seconds": seconds, "steps_per_second": rate, "curves": curves}
     states = jax.tree.map(lambda *each: jnp.concatenate(each), *(state for _, state in runs))
     for how in ("sampled", "mean") if episodes else ():
@@ -104,7 +105,11 @@ def main() -> None:
     found = search(points, arguments.episodes)
     found["drawn"] = {name: [getattr(point, name) for point in points.values()] for name in ranges}
     found |= {"task": arguments.task, "method": arguments.method, "fixed": arguments.fixed}
-    found |= {"device": jax.devices()[0].device_kind, "jax": jax.__version__, "engine": setup(config).vector.env.engine}
+    found |= {
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "engine": make_setup(config).vector.env.engine,
+    }
     arguments.out.write_text(json.dumps(found))
     print(f"{found['steps_per_second']:,.0f} steps/s over all draws; written to {arguments.out}")
 

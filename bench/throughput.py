@@ -39,10 +39,12 @@ import numpy as np
 import psutil
 
 import envs
-from envs import ant_corridor, hand_over
-from envs.physics import usable_cpus
-from pmt_jax import learner, load_config
-from pmt_jax.run import setup
+from envs.ant import corridor
+from envs.hands import hand_over
+from envs.physics.engines import usable_cpus
+from pmt_jax import load_config
+from pmt_jax.learning import learner
+from pmt_jax.learning.setup import make_setup
 
 from . import records
 from .engines import Measure, env_alone, repeated
@@ -114,7 +116,7 @@ class Subject:
 
 SUBJECTS = {
     "ant_2x4": Subject(
-        lambda: Plain(ant_corridor.model(), ant_corridor.SUBSTEPS, _reset_ant, _ant_over),
+        lambda: Plain(corridor.model(), corridor.SUBSTEPS, _reset_ant, _ant_over),
         (
             Engine("mujoco", {}, 5000.0),
             Engine("mjx", {"solver": "fast"}, 1000.0),
@@ -161,7 +163,7 @@ def at_once(loop: Callable[[int], float], threads: int, steps: int) -> float:
 
 def training(task: str, batch: int, steps: int) -> Measure:
     """The MAPPO-Lagrangian training loop on the task's own settings, as `pmt train` compiles it."""
-    run = setup(load_config(task, method="mappo_l", num_envs=batch, physics="mujoco"))
+    run = make_setup(load_config(task, method="mappo_l", num_envs=batch, physics="mujoco"))
     updates = max(1, steps // run.config.rollout_length)
 
     def chunk(hyper, state):
@@ -301,7 +303,7 @@ def starts(task: str, patience: float) -> Rows:
 def _start(folder: pathlib.Path, task: str, cache: str, *flags: str) -> Head:
     """Trains in a process of its own, 4,096 steps unless `flags` say otherwise, with its compile cache so named."""
     out = pathlib.Path(tempfile.mkdtemp(dir=folder))
-    command = [sys.executable, "-m", "pmt_jax.cli", "train", task, "--method", "mappo_l", "--log-interval", "1"]
+    command = [sys.executable, "-m", "pmt_jax", "train", task, "--method", "mappo_l", "--log-interval", "1"]
     command += ["--steps", "4096", "--out", str(out), *flags]
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / cache), "PYTHONPATH": os.pathsep.join(sys.path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pmt_jax import METHODS, load_config, make_train
-from pmt_jax.statistics import bootstrap_interval
+from pmt_jax.studies.statistics import bootstrap_interval
 
 from . import records
 from .tables import markdown

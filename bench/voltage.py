@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 from pmt_jax import METHODS, load_config
-from pmt_jax.experiment import evaluate_baseline
+from pmt_jax.policies.evaluate import evaluate_baseline
 
 from . import records
 from .search import search

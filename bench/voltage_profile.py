@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs.grid_data import ROWS_PER_DAY
-from envs.voltage_baselines import POLICIES, Policy
-from envs.voltage_control import VoltageControl
+from envs.voltage.baselines import POLICIES, Policy
+from envs.voltage.control import VoltageControl
+from envs.voltage.profiles import ROWS_PER_DAY
 
 
 def day_of_voltages(env: VoltageControl, policy: Policy, start_row: int) -> np.ndarray:

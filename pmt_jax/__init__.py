@@ -9,26 +9,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .config import Config, load_config
-    from .evaluation import evaluate
-    from .learner import init, make_train, train_step
-    from .methods import METHODS, Method
-    from .policy import load_policy
-    from .run import setup
+    from .config.methods import METHODS, Method
+    from .config.settings import Config, load_config
+    from .learning.evaluation import evaluate
+    from .learning.learner import init, make_train, train_step
+    from .learning.setup import make_setup
+    from .policies.load import load_policy
 
 __version__ = "0.1.0"
 
 _PLACES = {
-    "Config": "config",
-    "METHODS": "methods",
-    "Method": "methods",
-    "evaluate": "evaluation",
-    "init": "learner",
-    "load_config": "config",
-    "load_policy": "policy",
-    "make_train": "learner",
-    "setup": "run",
-    "train_step": "learner",
+    "Config": "config.settings",
+    "METHODS": "config.methods",
+    "Method": "config.methods",
+    "evaluate": "learning.evaluation",
+    "init": "learning.learner",
+    "load_config": "config.settings",
+    "load_policy": "policies.load",
+    "make_train": "learning.learner",
+    "make_setup": "learning.setup",
+    "train_step": "learning.learner",
 }
 
 __all__ = [
@@ -40,7 +40,7 @@ __all__ = [
     "load_config",
     "load_policy",
     "make_train",
-    "setup",
+    "make_setup",
     "train_step",
 ]
 

@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import envs
-from envs import ant_corridor
+from envs.ant import corridor
 from envs.errors import TaskError
 
 DATA = Path(__file__).parent / "data"
@@ -45,7 +45,7 @@ def inside_wall(rows) -> np.ndarray:
     """Rows whose torso overlaps a wall, six boxes 20 m to either side of their centre."""
     x, y = rows["qpos0"][:, 0], rows["qpos0"][:, 1]
     along = np.abs(x[:, None] - np.array([0.0, 40.0, 80.0])).min(axis=1) < 17.4
-    distance = np.abs(np.abs(np.asarray(ant_corridor.off_centre(x, y))) - 5.0) * np.cos(np.pi / 6)
+    distance = np.abs(np.abs(np.asarray(corridor.off_centre(x, y))) - 5.0) * np.cos(np.pi / 6)
     return along & (distance < 0.9)
 
 
@@ -121,7 +121,7 @@ def test_4x2_observations_on_mjx_from_its_2x4_states(replay):
 def test_walls_explain_the_rows_that_miss_the_tolerance():
     """With the six milligram boxes as free bodies, as in the original, those rows agree too."""
     rows = {k: v[inside_wall(recording("ant_2x4"))] for k, v in recording("ant_2x4").items()}
-    spec = mujoco.MjSpec.from_file(str(ant_corridor.MODEL))
+    spec = mujoco.MjSpec.from_file(str(corridor.MODEL))
     for x, yaw in ((0, 30), (40, -30), (80, 30)):
         for y in (5, -5):
             half = np.radians(yaw) / 2
@@ -144,7 +144,7 @@ def test_walls_explain_the_rows_that_miss_the_tolerance():
 
 
 def test_model_is_the_original_ant():
-    model = ant_corridor.model()
+    model = corridor.model()
     assert (model.nq, model.nv, model.nu, model.nbody) == (15, 14, 8, 14)
     np.testing.assert_allclose(model.body("torso").mass, 0.327249235, rtol=1e-8)
     np.testing.assert_allclose(model.body("aux_1").mass, 0.036476928, rtol=1e-7)
@@ -215,7 +215,7 @@ def test_reset_draws_what_the_task_says():
     env, _ = stepper("mujoco")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 4000))
     qpos, qvel = np.asarray(states.carry.physics.qpos), np.asarray(states.carry.physics.qvel)
-    offset = qpos - ant_corridor.model().qpos0
+    offset = qpos - corridor.model().qpos0
     free = [0, 1, 2, *range(7, 15)]
     assert 0.098 < np.abs(offset[:, free]).max() <= 0.1 + 1e-6
     np.testing.assert_allclose(offset[:, free].std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
@@ -263,14 +263,14 @@ def plain_danger(x: float, y: float) -> bool:
 @example(100.0, 20 * np.tan(np.pi / 6) - 5)
 @example(-40.0, -40 * np.tan(np.pi / 6) + 6.7)
 def test_danger_band_matches_a_plain_oracle(x, y):
-    off = abs(float(ant_corridor.off_centre(np.float64(x), np.float64(y))))
+    off = abs(float(corridor.off_centre(np.float64(x), np.float64(y))))
     if min(abs(off - 3.2), abs(off - 6.8)) > 1e-4:  # float32 may round either way at the very edge
-        assert bool(ant_corridor.in_danger(np.float64(x), np.float64(y))) == plain_danger(x, y)
+        assert bool(corridor.in_danger(np.float64(x), np.float64(y))) == plain_danger(x, y)
 
 
 def test_centre_line_is_continuous_at_the_folds():
     for x in (20.0, 100.0):
-        left, right = (float(ant_corridor.off_centre(jnp.float32(x + dx), jnp.float32(0.0))) for dx in (-1e-3, 1e-3))
+        left, right = (float(corridor.off_centre(jnp.float32(x + dx), jnp.float32(0.0))) for dx in (-1e-3, 1e-3))
         assert abs(left - right) < 2e-3
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from bench import compare, curves, paths, records, render, suite, tables
 from bench.__main__ import main
-from pmt_jax import table
+from pmt_jax.studies import table
 
 FAKE = """
 import json, os, signal, sys

@@ -41,7 +41,7 @@ def test_help_is_quick_and_needs_no_jax():
 
 
 def test_help_of_train_explains_every_setting():
-    result = subprocess.run([sys.executable, "-m", "pmt_jax.cli", "train", "--help"], capture_output=True, text=True)
+    result = subprocess.run([sys.executable, "-m", "pmt_jax", "train", "--help"], capture_output=True, text=True)
     for flag in ("--lambda-lr", "--num-envs", "--physics", "--env", "--resume"):
         assert flag in result.stdout
     assert "step of the multiplier per update" in " ".join(result.stdout.split())
@@ -92,9 +92,10 @@ def test_interrupted_and_resumed_is_as_if_nothing_had_happened(finished: pathlib
     for row in whole + halves:
         del row["seconds"]
     assert halves == whole
-    from pmt_jax import checkpoint, experiment
+    from pmt_jax.policies import load
+    from pmt_jax.training import checkpoint
 
-    states = [checkpoint.pack(experiment.load_run(folder)[1]) for folder in (finished, out)]
+    states = [checkpoint.pack(load.load_run(folder)[1]) for folder in (finished, out)]
     assert states[0].keys() == states[1].keys()
     assert all((states[0][path] == states[1][path]).all() for path in states[0])
 
@@ -111,7 +112,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
     command = [
         sys.executable,
         "-m",
-        "pmt_jax.cli",
+        "pmt_jax",
         "train",
         "lane",
         *map(str, TINY),
@@ -141,7 +142,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
 
 
 def test_output_that_nobody_reads_any_more(finished: pathlib.Path):
-    command = f"{sys.executable} -m pmt_jax.cli eval {finished} --episodes 2 | true"
+    command = f"{sys.executable} -m pmt_jax eval {finished} --episodes 2 | true"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     for environment in (buffered, buffered | {"PYTHONUNBUFFERED": "1"}):
         result = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True)
@@ -208,7 +209,7 @@ def test_another_package_named_envs_is_noticed(tmp_path: pathlib.Path):
     (tmp_path / "envs").mkdir()
     (tmp_path / "envs" / "__init__.py").write_text("")
     result = subprocess.run(
-        [sys.executable, "-m", "pmt_jax.cli", "train", "lane"],
+        [sys.executable, "-m", "pmt_jax", "train", "lane"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(tmp_path)},
         capture_output=True,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import envs
 from pmt_jax import METHODS, load_config
-from pmt_jax.config import CONFIG_DIR, FIELDS, Config, descriptions, to_toml
+from pmt_jax.config.settings import CONFIG_DIR, FIELDS, Config, descriptions, to_toml
 from pmt_jax.errors import UsageError
 
 
@@ -73,7 +73,7 @@ def test_words_of_a_command_line_become_typed():
         ({"minibatches": 7}, "cannot be cut into 7 equal minibatches"),
         ({"activation": "sine"}, "expected relu | tanh | elu"),
         ({"layer_norm": "maybe"}, "expected true or false"),
-        ({"discount": 1.5}, r"discount must lie in [0, 1], not 1.5"),
+        ({"gamma": 1.5}, r"gamma must lie in [0, 1], not 1.5"),
         ({"actor_lr": -1}, "actor_lr must be a number that is not negative"),
         ({"actor_lr": float("nan")}, "actor_lr must be a number that is not negative"),
         ({"kl_max": 0}, "kl_max must be a number of nats above 0, or inf"),

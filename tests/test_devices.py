@@ -13,7 +13,8 @@ import jax
 import numpy as np
 import pytest
 
-from pmt_jax import checkpoint, experiment
+from pmt_jax.policies import load
+from pmt_jax.training import checkpoint
 
 ROOT = pathlib.Path(__file__).parents[1]
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
@@ -34,16 +35,17 @@ def environment(**more: str) -> dict[str, str]:
 COMPARE = r"""
 import dataclasses, json, re, sys
 import jax, numpy as np
-from pmt_jax import checkpoint, load_config, setup
-from pmt_jax.compiling import compile_run
-from pmt_jax.devices import make_mesh
-from pmt_jax.processes import make_room
+from pmt_jax.training import checkpoint
+from pmt_jax import load_config, make_setup
+from pmt_jax.training.compile import compile_run
+from pmt_jax.learning.sharding import make_mesh
+from pmt_jax.training.processes import make_room
 
 make_room()
 
 def train(count, task, **sizes):
     config = load_config(task, rollout_length=4, hidden=(8,), minibatches=2, log_interval=2, **sizes)
-    run = dataclasses.replace(setup(config), mesh=make_mesh(config, count))
+    run = dataclasses.replace(make_setup(config), mesh=make_mesh(config, count))
     state, programs = compile_run(run, lambda _: None)
     program = programs.chunk.func.as_text()
     state, metrics = programs.chunk(state)
@@ -51,7 +53,7 @@ def train(count, task, **sizes):
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
-    from envs import physics
+    from envs.physics.engines import engines
     physics.obstacle = lambda name: None
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
@@ -118,7 +120,7 @@ def together(out: pathlib.Path, *arguments: object, slurm: bool = False) -> list
         step = {"SLURM_JOB_ID": "1", "SLURM_STEP_NODELIST": "localhost", "SLURM_STEP_NUM_TASKS": "2"}
         step |= {"SLURM_NTASKS": "2", "SLURM_PROCID": str(i), "SLURM_LOCALID": str(i), "JAX_COORDINATOR_PORT": port}
         words = [*arguments, "--out", out, *(() if slurm else flags)]
-        command = [sys.executable, "-m", "pmt_jax.cli", *(str(word) for word in words)]
+        command = [sys.executable, "-m", "pmt_jax", *(str(word) for word in words)]
         env = environment(**(step if slurm else {}))
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         processes.append(subprocess.Popen(command, env=env, text=True, **pipes))
@@ -140,7 +142,7 @@ def assert_close(out: pathlib.Path, other: pathlib.Path) -> None:
             same = one[name] == two[name] or one[name] == pytest.approx(two[name], rel=1e-3, abs=1e-5)
             assert same, (name, one[name], two[name])
     for which in ("last", "best"):
-        first, second = (checkpoint.pack(experiment.load_run(folder, which)[1]) for folder in (out, other))
+        first, second = (checkpoint.pack(load.load_run(folder, which)[1]) for folder in (out, other))
         assert first.keys() == second.keys()
         for path, x in first.items():
             np.testing.assert_allclose(x, second[path], rtol=1e-3, atol=1e-5, err_msg=path)

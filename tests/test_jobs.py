@@ -13,7 +13,9 @@ import types
 
 import pytest
 
-from pmt_jax import checkpoint, experiment, jobs
+from pmt_jax.policies import load
+from pmt_jax.studies import workers
+from pmt_jax.training import checkpoint
 
 ROOT = pathlib.Path(__file__).parents[1]
 
@@ -41,7 +43,7 @@ def test_so_many_at_a_time_and_no_more(tmp_path: pathlib.Path):
         (here / f"ended-{{os.getpid()}}").touch()
     """)
     said: list[str] = []
-    assert jobs.run([meeting] * 5, 2, said.append) == 0
+    assert workers.run([meeting] * 5, 2, said.append) == 0
     assert sorted(line.split()[0] for line in said) == [f"[{i}]" for i in range(1, 6)]
     assert max(int(line.split()[1]) for line in said) == 2
 
@@ -56,29 +58,29 @@ def test_programs_are_spread_over_the_gpus(tmp_path: pathlib.Path, monkeypatch: 
         print(mine)
     """)
     said: list[str] = []
-    assert jobs.run([meeting] * 4, 4, said.append, ("3", "5")) == 0
+    assert workers.run([meeting] * 4, 4, said.append, ("3", "5")) == 0
     assert sorted(line.split()[1] for line in said) == ["3", "3", "5", "5"]
-    assert jobs.gpus() == ()  # a CPU is shared as it is
+    assert workers.gpus() == ()  # a CPU is shared as it is
     gpu = types.SimpleNamespace(platform="gpu")
-    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu, gpu])
+    monkeypatch.setattr(workers.jax, "local_devices", lambda: [gpu, gpu])
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert jobs.gpus() == ("0", "1")
+    assert workers.gpus() == ("0", "1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,GPU-7")
-    assert jobs.gpus() == ("2", "GPU-7")
-    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu])
-    assert jobs.gpus() == ()
+    assert workers.gpus() == ("2", "GPU-7")
+    monkeypatch.setattr(workers.jax, "local_devices", lambda: [gpu])
+    assert workers.gpus() == ()
 
 
 def test_after_a_failure_no_other_is_started_and_those_that_run_go_on():
     said: list[str] = []
     slow = program("import time; time.sleep(2); print('done')")
-    assert jobs.run([program("raise SystemExit(3)"), slow, program("print('never')")], 2, said.append) == 3
+    assert workers.run([program("raise SystemExit(3)"), slow, program("print('never')")], 2, said.append) == 3
     assert said == ["[2] done"]
 
 
 WAITING = """
 import pathlib, signal, sys, threading, time
-from pmt_jax import jobs
+from pmt_jax.studies import workers
 file = pathlib.Path(sys.argv[1])
 def end(number, _):
     file.write_text(str(number))
@@ -116,7 +118,7 @@ def test_a_sweep_of_two_programs_at_a_time(tmp_path: pathlib.Path, cli):
     assert all(f"[{i}] pmt: happo on lane" in out and f"[{i}] steps 200" in out for i in (1, 2))
     assert "best first" in out.split("[2] done")[-1]
     assert cli("train", "lane", "--hidden", 8, *tiny, tmp_path / "alone")[0] == 0
-    both, alone = (checkpoint.pack(experiment.load_run(tmp_path / x)[1]) for x in ("both/hidden=8", "alone"))
+    both, alone = (checkpoint.pack(load.load_run(tmp_path / x)[1]) for x in ("both/hidden=8", "alone"))
     assert all((both[name] == alone[name]).all() for name in alone)
     code, out, _ = cli("sweep", *sizes, tmp_path / "both", "--jobs", 2)
     assert code == 0 and "2 of 2 points are finished already" in out and "compiling" not in out

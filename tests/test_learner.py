@@ -13,8 +13,9 @@ import pytest
 
 import envs
 from envs.toys import Lane
-from pmt_jax import METHODS, learner, load_config, make_train, policy_update, rollout, setup
-from pmt_jax.types import LearnerState, Tag
+from pmt_jax import METHODS, load_config, make_setup, make_train
+from pmt_jax.learning import learner, policy_update, rollout
+from pmt_jax.learning.types import LearnerState, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
 
@@ -94,7 +95,7 @@ def test_regret_stands_still_where_nothing_ever_costs():
 
     regretful = trained("r4sg")
     chex.assert_trees_all_equal(weights(regretful), weights(trained("mappo_l")))
-    run = setup(load_config("lane", method="r4sg", **SMALL), Harmless())
+    run = make_setup(load_config("lane", method="r4sg", **SMALL), Harmless())
     start = learner.init(run, run.hyper, jax.random.key(0))
     chex.assert_trees_all_close(regretful.regret.params, start.regret.params, rtol=1e-6)
 
@@ -104,7 +105,7 @@ def test_regret_stands_still_where_nothing_ever_costs():
 
 
 def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
-    run = setup(load_config("lane", method="mappo_l", **SMALL))
+    run = make_setup(load_config("lane", method="mappo_l", **SMALL))
     hyper = run.hyper
     state = learner.init(run, hyper, jax.random.key(0))
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
@@ -112,16 +113,21 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
     rows = policy_update.policy_rows(run, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob))
     violation = jnp.asarray([[0.5], [0.25]])
-    actor, multiplier, _ = policy_update._in_turn(run, hyper, state, rows, violation, tagged)
+    actor, multiplier, _ = policy_update._sequential(run, hyper, state, rows, violation, tagged)
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)
     for i in np.asarray(jax.random.permutation(tagged[Tag.ORDER], 2)):
-        mine = dataclasses.replace(policy_update._of(rows, i), factor=factor)
-        net, _ = policy_update.improve(
-            run, hyper, policy_update._of(state.actor, i), mine, violation[i], jax.random.fold_in(tagged[Tag.ACTOR], i)
+        mine = dataclasses.replace(policy_update._select_agent(rows, i), factor=factor)
+        net, _ = policy_update.update_policy(
+            run,
+            hyper,
+            policy_update._select_agent(state.actor, i),
+            mine,
+            violation[i],
+            jax.random.fold_in(tagged[Tag.ACTOR], i),
         )
-        chex.assert_trees_all_close(net.params, policy_update._of(actor.params, i), rtol=1e-5, atol=1e-6)
+        chex.assert_trees_all_close(net.params, policy_update._select_agent(actor.params, i), rtol=1e-5, atol=1e-6)
         log_ratio = policy_update._moved(run, net.params, mine)[0]
         surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
         expected = 0.78 + hyper.lambda_lr * (violation[i, 0] + surrogate)
@@ -162,7 +168,7 @@ def test_jitted_or_not():
 @pytest.mark.parametrize("method", METHODS)
 def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str, env: object):
     own = TwoDangers() if env == "two costs" else envs.make("lane", **env) if isinstance(env, dict) else None
-    run = setup(load_config("lane", method=method, **SMALL), own)
+    run = make_setup(load_config("lane", method=method, **SMALL), own)
     before = jax.eval_shape(functools.partial(learner.init, run), run.hyper, jax.random.key(0))
     after, _ = jax.eval_shape(functools.partial(learner.train_step, run), run.hyper, before)
     chex.assert_trees_all_equal_structs(before, after)
@@ -173,7 +179,7 @@ def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str
 
 def test_hyper_parameters_are_traced_and_can_be_swept():
     config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 200})
-    train, base = make_train(config), setup(config).hyper
+    train, base = make_train(config), make_setup(config).hyper
     sweep = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
     sweep = dataclasses.replace(sweep, lambda_lr=jnp.asarray([0.0, 0.1, 1.0]))
     state, _ = jax.jit(jax.vmap(train, (None, 0)))(jax.random.key(0), sweep)
@@ -182,8 +188,8 @@ def test_hyper_parameters_are_traced_and_can_be_swept():
 
 
 def test_step_sizes_of_all_networks_halve_in_their_half_life():
-    run = setup(load_config("lane", method="mixed", **SMALL))
-    rates = ("actor_lr", "critic_lr", "appraisal_lr")
+    run = make_setup(load_config("lane", method="mixed", **SMALL))
+    rates = ("actor_lr", "critic_lr", "emotion_lr")
     halved = dataclasses.replace(run.hyper, **{name: getattr(run.hyper, name) / 2 for name in rates})
     falling = dataclasses.replace(run.hyper, lr_half_life=jnp.float32(run.config.batch_size))
     step = jax.jit(lambda hyper, state: learner.train_step(run, hyper, state)[0])
@@ -199,7 +205,7 @@ def test_step_sizes_of_all_networks_halve_in_their_half_life():
 @pytest.mark.parametrize("method", ["mappo", "r4sg"])
 def test_an_update_moves_no_policy_further_than_kl_max(method):
     """A shared actor moves for all agents at once, so its bound holds for their mean."""
-    run = setup(load_config("lane", method=method, actor_lr=3e-3, **SMALL))
+    run = make_setup(load_config("lane", method=method, actor_lr=3e-3, **SMALL))
     step = jax.jit(lambda hyper, state: learner.train_step(run, hyper, state))
     start = learner.init(run, run.hyper, jax.random.key(0))
     free, figures = step(run.hyper, start)
@@ -249,7 +255,7 @@ def test_two_costs_have_a_multiplier_each():
 
 
 def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
-    run = setup(load_config("lane", **{**SMALL, "rollout_length": 5, "steps": 100}))
+    run = make_setup(load_config("lane", **{**SMALL, "rollout_length": 5, "steps": 100}))
     state = learner.init(run, run.hyper, jax.random.key(0))
     _, batch = learner._act(run, state, jax.random.key(1))
     previous = jnp.full((2, 1), 7.0)
@@ -330,7 +336,7 @@ def test_the_letter_of_the_paper_runs():
 
 def test_every_network_keeps_what_it_learned():
     state, _ = small_run("mixed", task="switch")
-    run = setup(load_config("switch", method="mixed", **SMALL))
+    run = make_setup(load_config("switch", method="mixed", **SMALL))
     start = jax.vmap(lambda key: learner.init(run, run.hyper, key))(jax.vmap(jax.random.key)(jnp.arange(1)))
 
     def nets(state: LearnerState):

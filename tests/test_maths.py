@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pmt_jax import distributions, dual, normalise
-from pmt_jax.coping import clipped_surrogate, hybrid_advantage
-from pmt_jax.fit import fit, huber, untrained, value_loss
-from pmt_jax.networks import LayerNorm
-from pmt_jax.returns import gae, standardise
+from pmt_jax.learning.maths import distributions, lagrangian, running_moments
+from pmt_jax.learning.maths.advantages import gae, standardise
+from pmt_jax.learning.maths.losses import clipped_surrogate, hybrid_advantage
+from pmt_jax.learning.networks import LayerNorm
+from pmt_jax.learning.optimise import fit, huber, init_train_state, value_loss
 
 
 def column(x: list[float], dtype: type = float) -> jax.Array:
@@ -38,12 +38,12 @@ def test_gae_bootstraps_at_a_truncation_and_not_at_a_termination():
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-10, 10, width=32), min_size=6, max_size=6), st.floats(0, 1))
-def test_gae_without_decay_is_the_discounted_sum(signal: list[float], discount: float):
+def test_gae_without_decay_is_the_discounted_sum(signal: list[float], gamma: float):
     x, never = column(signal), jnp.zeros((6, 1), bool)
     value = jnp.arange(1.0, 7.0)[:, None]
     next_value = jnp.concatenate([value[1:], jnp.zeros((1, 1))])
-    _, returns = gae(x, value, next_value, never, never, discount, 1.0)
-    expected = [sum(discount ** (s - t) * signal[s] for s in range(t, 6)) for t in range(6)]
+    _, returns = gae(x, value, next_value, never, never, gamma, 1.0)
+    expected = [sum(gamma ** (s - t) * signal[s] for s in range(t, 6)) for t in range(6)]
     np.testing.assert_allclose(returns[:, 0], expected, atol=1e-3)
 
 
@@ -67,29 +67,33 @@ def test_standardise_centres_and_never_divides_by_less_than_the_floor():
 
 
 def test_forgetting_moments():
-    moments = normalise.forget(normalise.init(()), jnp.asarray([1.0, 3.0]), 0.5)
-    mean, scale = normalise.centre_and_scale(moments)
-    np.testing.assert_allclose([mean, scale, normalise.normalise(moments, jnp.asarray(3.0))], [2, 1, 1], rtol=1e-6)
-    moments = normalise.forget(moments, jnp.asarray([5.0, 7.0]), 0.5)
-    mean, scale = normalise.centre_and_scale(moments)
+    moments = running_moments.update_ema(running_moments.init(()), jnp.asarray([1.0, 3.0]), 0.5)
+    mean, scale = running_moments.centre_and_scale(moments)
+    np.testing.assert_allclose(
+        [mean, scale, running_moments.normalise(moments, jnp.asarray(3.0))], [2, 1, 1], rtol=1e-6
+    )
+    moments = running_moments.update_ema(moments, jnp.asarray([5.0, 7.0]), 0.5)
+    mean, scale = running_moments.centre_and_scale(moments)
     np.testing.assert_allclose([mean, scale**2], [4.66667, 4.55556], rtol=1e-5)
-    np.testing.assert_allclose(normalise.normalise(moments, jnp.asarray(3.0)), -0.780869, rtol=1e-5)
-    np.testing.assert_allclose(normalise.denormalise(moments, normalise.normalise(moments, jnp.asarray(9.0))), 9)
+    np.testing.assert_allclose(running_moments.normalise(moments, jnp.asarray(3.0)), -0.780869, rtol=1e-5)
+    np.testing.assert_allclose(
+        running_moments.denormalise(moments, running_moments.normalise(moments, jnp.asarray(9.0))), 9
+    )
 
 
 def test_moments_of_nothing_normalise_as_the_identity():
     x = jnp.asarray([3.0, -4.0])
-    np.testing.assert_array_equal(normalise.normalise(normalise.init((2,)), x), x)
-    np.testing.assert_array_equal(normalise.normalise_obs(normalise.init((2,)), x), x)
+    np.testing.assert_array_equal(running_moments.normalise(running_moments.init((2,)), x), x)
+    np.testing.assert_array_equal(running_moments.normalise_obs(running_moments.init((2,)), x), x)
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-1e3, 1e3), st.integers(1, 9))
 def test_accumulated_moments_equal_those_of_everything_seen(offset: float, cut: int):
     x = offset + np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
-    moments = normalise.init((3,))
+    moments = running_moments.init((3,))
     for part in (x[:cut], x[cut:]):
-        moments = normalise.accumulate(moments, jnp.asarray(part))
+        moments = running_moments.accumulate(moments, jnp.asarray(part))
     np.testing.assert_allclose(moments.mean, x.mean(0), rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(moments.second, x.var(0), rtol=1e-2, atol=1e-3)
 
@@ -142,16 +146,16 @@ def test_hybrid_advantage():
 @pytest.mark.parametrize(("cost_advantage", "expected"), [([0.5, -0.25], 0.805), ([0.5, 0.25], 0.855)])
 def test_dual_update(cost_advantage: list[float], expected: float):
     surrogate = jnp.mean(jnp.asarray([1.0, 2.0]) * jnp.asarray(cost_advantage))
-    violation = dual.violation(jnp.asarray(30.0), 5.0, 100)
+    violation = lagrangian.cost_excess(jnp.asarray(30.0), 5.0, 100)
     np.testing.assert_allclose(
-        dual.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6
+        lagrangian.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6
     )
 
 
 def test_dual_update_is_projected():
-    violation = dual.violation(jnp.asarray(0.0), 50.0, 100)
-    assert dual.dual_update(jnp.asarray(0.78), violation, jnp.asarray(0.0), 2.0, 20.0) == 0
-    assert dual.dual_update(jnp.asarray(19.9), -violation, jnp.asarray(0.0), 2.0, 20.0) == 20
+    violation = lagrangian.cost_excess(jnp.asarray(0.0), 50.0, 100)
+    assert lagrangian.dual_update(jnp.asarray(0.78), violation, jnp.asarray(0.0), 2.0, 20.0) == 0
+    assert lagrangian.dual_update(jnp.asarray(19.9), -violation, jnp.asarray(0.0), 2.0, 20.0) == 20
 
 
 def test_log_prob_and_entropy_agree_with_scipy():
@@ -201,7 +205,7 @@ def test_fit_finds_the_least_squares_solution_and_sees_every_row_in_each_epoch()
         return jnp.mean((inputs @ params - target) ** 2), {"mean_target": target.mean()}
 
     settings_ = {"learning_rate": 0.05, "max_grad_norm": 10.0, "epochs": 100, "minibatches": 4}
-    net, metrics = fit(untrained(jnp.zeros(3)), loss, (x, x @ weights), jax.random.key(1), **settings_)
+    net, metrics = fit(init_train_state(jnp.zeros(3)), loss, (x, x @ weights), jax.random.key(1), **settings_)
     np.testing.assert_allclose(net.params, weights, atol=1e-2)
     np.testing.assert_allclose(metrics["mean_target"], (x @ weights).mean(), rtol=1e-5)
 
@@ -212,7 +216,7 @@ def test_fit_scales_gradients_down_to_the_given_norm():
 
     one_step = {"learning_rate": 1.0, "epochs": 1, "minibatches": 1}
     net, metrics = fit(
-        untrained(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step
+        init_train_state(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step
     )
     # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
     np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)

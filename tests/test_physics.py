@@ -15,26 +15,27 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import ant_corridor, physics
+from envs.ant import corridor
 from envs.errors import TaskError
+from envs.physics.engines import engines
 
 ROOT = Path(__file__).parents[1]
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 
 
 def engine(**options):
-    return physics.make_engine(ant_corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
+    return engines.make_engine(corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
 
 
 def starts(count: int, seed: int = 0):
     """States [count] in the air and on the ground, moving, and random controls."""
     rng = np.random.default_rng(seed)
-    qpos = np.tile(ant_corridor.model().qpos0, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 15))
+    qpos = np.tile(corridor.model().qpos0, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 15))
     qpos[:, 2] = rng.uniform(0.3, 0.8, count)
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     qvel, ctrl = rng.normal(size=(count, 14)), rng.uniform(-1.2, 1.2, (count, 8))
     f32 = jnp.float32
-    state = physics.PhysicsState(jnp.asarray(qpos, f32), jnp.asarray(qvel, f32), jnp.zeros((count, 14), f32))
+    state = engines.PhysicsState(jnp.asarray(qpos, f32), jnp.asarray(qvel, f32), jnp.zeros((count, 14), f32))
     return state, jnp.asarray(ctrl, f32)
 
 
@@ -73,7 +74,7 @@ def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
 def test_c_engine_is_a_plain_loop_over_mujoco():
     state, ctrl = starts(4)
     after, out = jax.vmap(engine().step)(state, ctrl)
-    model = ant_corridor.model()
+    model = corridor.model()
     data = mujoco.MjData(model)
     for i in range(4):
         mujoco.mj_resetData(model, data)
@@ -91,7 +92,7 @@ def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(tmp_path, monk
     state, ctrl = starts(8)
     step = jax.jit(jax.vmap(engine(threads=1).step))
     healthy = step(state, ctrl)
-    broken = physics.PhysicsState(
+    broken = engines.PhysicsState(
         state.qpos.at[2, 4].set(jnp.nan), state.qvel.at[4].set(1e9).at[5, 0].set(3e38), state.warmstart
     )
     after, out = step(broken, ctrl.at[6, 0].set(jnp.inf))
@@ -133,7 +134,7 @@ def test_two_programs_at_once_share_the_threads():
 
 
 def test_team_does_each_piece_once_and_leaves_nobody_behind():
-    team = physics._Team()
+    team = engines._Team()
     for threads in (1, 2, 5):
         queue, taken, at_work = iter(range(50)), [], []
 
@@ -150,7 +151,7 @@ def test_team_does_each_piece_once_and_leaves_nobody_behind():
 
 @pytest.mark.parametrize("guilty", ["the caller", "a helper"])
 def test_team_passes_errors_on_and_stops(guilty):
-    team, queue, caller, taken = physics._Team(), iter(range(1000)), threading.get_ident(), []
+    team, queue, caller, taken = engines._Team(), iter(range(1000)), threading.get_ident(), []
 
     def work():
         for piece in queue:
@@ -259,27 +260,27 @@ def test_interrupt_inside_a_step_never_passes_for_a_result():
 
 
 def test_hooks_are_where_we_expect_them():
-    physics.check_hooks()
+    engines.check_hooks()
 
 
 def test_hooks_are_put_back_after_tracing():
-    physics.import_mjx()
+    engines.import_mjx()
     from mujoco.mjx._src import collision_driver, solver
 
     before = dict(collision_driver._COLLISION_FUNC), solver._while_loop_scan
-    with pytest.raises(ZeroDivisionError), physics._hooked():
+    with pytest.raises(ZeroDivisionError), engines._hooked():
         assert solver._while_loop_scan is not before[1]
         raise ZeroDivisionError
     assert (collision_driver._COLLISION_FUNC, solver._while_loop_scan) == before
 
 
 def test_missing_hooks_are_a_clear_error(monkeypatch):
-    physics.import_mjx()
+    engines.import_mjx()
     from mujoco.mjx._src import solver
 
     monkeypatch.delattr(solver, "_while_loop_scan")
     with pytest.raises(TaskError, match="lacks the private hooks"):
-        physics.check_hooks()
+        engines.check_hooks()
 
 
 @pytest.mark.parametrize(
@@ -291,23 +292,23 @@ def test_missing_hooks_are_a_clear_error(monkeypatch):
     ],
 )
 def test_wrong_versions_are_refused(monkeypatch, found, said):
-    monkeypatch.setattr(physics, "_version", found.get)
+    monkeypatch.setattr(engines, "_version", found.get)
     with pytest.raises(TaskError, match=said):
-        physics.check_versions()
+        engines.check_versions()
 
 
 def test_jax_that_deadlocks_is_refused(monkeypatch):
     monkeypatch.setattr(jax, "__version__", "0.10.1")
     with pytest.raises(TaskError, match="deadlocks"):
-        physics.check_versions()
+        engines.check_versions()
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="says what a CPU lacks")
 def test_warp_without_a_gpu_is_one_sentence():
     with pytest.raises(TaskError, match="physics 'warp' needs an NVIDIA GPU; found cpu"):
         engine(physics="warp")
-    assert physics.explain()["mujoco"] is None and physics.explain()["warp"] is not None
-    assert physics.resolve("auto") == "mujoco"
+    assert engines.explain()["mujoco"] is None and engines.explain()["warp"] is not None
+    assert engines.resolve("auto") == "mujoco"
 
 
 def test_warp_without_its_package_is_one_sentence(monkeypatch):
@@ -315,20 +316,20 @@ def test_warp_without_its_package_is_one_sentence(monkeypatch):
         platform, device_kind = "gpu", "NVIDIA H200"
 
     monkeypatch.setattr(jax, "devices", lambda: [Gpu])
-    monkeypatch.setattr(physics, "_version", lambda _: None)
+    monkeypatch.setattr(engines, "_version", lambda _: None)
     with pytest.raises(TaskError, match=r"needs warp-lang; found none; install it with pip install 'pmt-jax\[warp\]'"):
-        physics.resolve("warp")
-    assert physics.resolve("auto") == "mjx"
+        engines.resolve("warp")
+    assert engines.resolve("auto") == "mjx"
     with pytest.raises(TaskError, match="runs on CPUs only"):
-        physics.resolve("mujoco")
+        engines.resolve("mujoco")
 
 
 def test_room_for_contacts_in_warp():
-    assert physics._room(ant_corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
+    assert engines._room(corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
 
 
 def test_flattened_turns_any_vmap_into_one_batch():
-    doubled = physics._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+    doubled = engines._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
 
     def lone(x, y):
         return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))

@@ -15,8 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pmt_jax import episode, feeder, page, render, report, tasks
+from pmt_jax import tasks
 from pmt_jax.errors import UsageError
+from pmt_jax.render import episode, film, grid_map, page, report
+from pmt_jax.studies import plot
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1, "--no-cache")
 
@@ -114,7 +116,7 @@ def test_leaving_steps_out_hides_no_cost(ant: episode.Episode):
 
 
 def test_a_scene_holds_walls_bands_and_the_moment_of_cost(ant: episode.Episode):
-    from pmt_jax import scenes
+    from pmt_jax.render import scenes
 
     model = ant.env.model
     looks = []
@@ -149,7 +151,7 @@ def test_geoms_that_come_and_go_keep_their_place():
     """A decoration appended at the cost alone must not move the bodies behind it, nor stay."""
     import mujoco
 
-    from pmt_jax import scenes
+    from pmt_jax.render import scenes
 
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
 
@@ -173,7 +175,7 @@ def test_geoms_that_come_and_go_keep_their_place():
 @settings(max_examples=40, deadline=None)
 def test_a_feeder_is_laid_out_without_crossings(count: int, random):
     branches = np.array([(random.randrange(max(0, bus - 4), bus), bus) for bus in range(1, count)])
-    x, y = feeder.layout(branches, 0, count)
+    x, y = grid_map.layout(branches, 0, count)
     assert len({(round(a, 6), round(b, 6)) for a, b in zip(x, y, strict=True)}) == count
     for a, b in branches.tolist():
         assert x[b] > x[a]  # away from the substation
@@ -187,7 +189,7 @@ def test_the_map_shows_voltages_against_the_band(grid: episode.Episode):
     assert data["kind"] == "map" and data["map"]["band"] == [0.95, 1.05]
     assert len(data["map"]["links"]) == 32 and len(data["map"]["agents"]) == 6
     np.testing.assert_array_equal(floats(data["map"]["values"], 2, 33), grid.raw["vm_pu"])
-    low, middle, high = feeder.voltage_colours(np.array([0.94, 1.0, 1.06]), (0.95, 1.05))
+    low, middle, high = grid_map.voltage_colours(np.array([0.94, 1.0, 1.06]), (0.95, 1.05))
     assert low[2] > 1.5 * low[0] and high[0] > 1.5 * high[2] and np.ptp(middle) < 0.05
 
 
@@ -198,15 +200,15 @@ def test_the_map_shows_voltages_against_the_band(grid: episode.Episode):
 def test_a_film_of_the_grid(grid: episode.Episode, tmp_path: pathlib.Path, monkeypatch):
     from PIL import Image
 
-    monkeypatch.setattr(render, "record_run", lambda *_: grid)
+    monkeypatch.setattr(film, "record_run", lambda *_: grid)
     out = tmp_path / "grid.gif"
-    render.render(tmp_path, out, size=(320, 180), say=lambda _: None)
-    film = Image.open(out)
-    assert film.size == (320, 180) and film.n_frames == 2
+    film.render(tmp_path, out, size=(320, 180), say=lambda _: None)
+    picture = Image.open(out)
+    assert picture.size == (320, 180) and picture.n_frames == 2
     corners = []
     for frame in range(2):
-        film.seek(frame)
-        corners.append(film.convert("RGB").getpixel((0, 0)))
+        picture.seek(frame)
+        corners.append(picture.convert("RGB").getpixel((0, 0)))
     assert corners[0][1] > 200 and corners[1][0] > 1.5 * corners[1][1]  # framed in red where it costs
     assert [p.name for p in tmp_path.iterdir()] == ["grid.gif"]
 
@@ -216,28 +218,28 @@ def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeyp
     """With OpenGL, the picture is red where it costs; without, a sentence names the way out."""
     from PIL import Image
 
-    monkeypatch.setattr(render, "record_run", lambda *_: ant)
+    monkeypatch.setattr(film, "record_run", lambda *_: ant)
     out = tmp_path / "ant.gif"
     try:
-        render.gl_platform()
+        film.gl_platform()
     except UsageError as error:
         assert "-o replay.html" in str(error)
         pytest.skip("no OpenGL on this machine")
-    render.render(tmp_path, out, size=(320, 180), say=lambda _: None)
-    film = Image.open(out)
+    film.render(tmp_path, out, size=(320, 180), say=lambda _: None)
+    picture = Image.open(out)
     redness = []
     for frame in range(3):
-        film.seek(frame)
-        pixels = np.asarray(film.convert("RGB"), float)[60:120, 100:220]
+        picture.seek(frame)
+        pixels = np.asarray(picture.convert("RGB"), float)[60:120, 100:220]
         redness.append((pixels[..., 0] - pixels[..., 1]).mean())
     assert redness[2] > 2 * redness[0] + 5
 
 
 def test_without_opengl_a_sentence_names_the_way_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(render, "_PROBE", "raise SystemExit(1)  # {0}")
+    monkeypatch.setattr(film, "_PROBE", "raise SystemExit(1)  # {0}")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with pytest.raises(UsageError, match=r"no OpenGL works here \(tried .*-o replay.html"):
-        render.gl_platform()
+        film.gl_platform()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -265,12 +267,12 @@ def test_figures_are_read_as_they_stand(tmp_path: pathlib.Path):
         row(20, 1, 5.0),
         '{"step": 30, "seed": 0}\n{"step": 30, "se',
     ]
-    curves = report.read(written(tmp_path / "a", lines))
+    curves = plot.read(written(tmp_path / "a", lines))
     assert curves.steps.tolist() == [10, 20] and curves.seeds == (0, 1)
     np.testing.assert_array_equal(curves.figures["episode_reward"], [[np.nan, 3], [2, 5]])
     many = [row(step, 0, float(step)) for step in range(1, 1001)]
-    curves = report.read(written(tmp_path / "b", many))
-    assert len(curves.steps) == report.POINTS and curves.steps[-1] == 1000
+    curves = plot.read(written(tmp_path / "b", many))
+    assert len(curves.steps) == plot.POINTS and curves.steps[-1] == 1000
     np.testing.assert_allclose(curves.figures["episode_reward"][0, :2], [5.5, 15.5])
 
 
@@ -279,25 +281,25 @@ def test_runs_that_differ_in_seeds_alone_are_one_curve(tmp_path: pathlib.Path):
     runs = []
     for name, rate, seed, length in (("a", 0.1, 0, 3), ("b", 0.1, 1, 2), ("c", 0.3, 0, 3)):
         lines = [row(step, seed, 10.0 * step) for step in range(1, length + 1)]
-        runs.append(report.read(written(tmp_path / name, lines, config.format(rate, seed))))
-    pooled = report.pool(runs)
+        runs.append(plot.read(written(tmp_path / name, lines, config.format(rate, seed))))
+    pooled = plot.pool(runs)
     assert [run.seeds for run in pooled] == [(0, 1), (0,)]
     np.testing.assert_array_equal(pooled[0].figures["episode_reward"], [[10, 20, 30], [10, 20, np.nan]])
-    assert report.labels(pooled) == ["mappo_l, lambda_lr = 0.1", "mappo_l, lambda_lr = 0.3"]
+    assert plot.labels(pooled) == ["mappo_l, lambda_lr = 0.1", "mappo_l, lambda_lr = 0.3"]
 
 
 def test_a_setting_that_a_run_does_not_name_has_its_default(tmp_path: pathlib.Path):
     config = 'task = "lane"\nlambda_lr = 0.1\n'
     settings = (config, config + "lr_half_life = inf\n", config + "lr_half_life = 1e6\n")
-    runs = [report.read(written(tmp_path / f"{i}", [row(10, 0, 1.0)], text)) for i, text in enumerate(settings)]
-    assert report.labels(runs) == [f"mappo_l, lr_half_life = {x}" for x in ("inf", "inf", "1e+06")]
+    runs = [plot.read(written(tmp_path / f"{i}", [row(10, 0, 1.0)], text)) for i, text in enumerate(settings)]
+    assert plot.labels(runs) == [f"mappo_l, lr_half_life = {x}" for x in ("inf", "inf", "1e+06")]
 
 
 def test_long_names_of_many_runs_stand_below_one_another_and_within_the_picture(tmp_path: pathlib.Path):
     config = 'task = "lane"\nlr_half_life = {0}\ncritic_lr = {0}\nminibatches = {0}\nrollout_length = {0}\n'
     folders = [written(tmp_path / f"{i}", [row(10, 0, 1.0)], config.format(i)) for i in range(1, 9)]
     out = tmp_path / "curves.svg"
-    report.draw([report.read(folder) for folder in folders], out)
+    plot.draw([plot.read(folder) for folder in folders], out)
     names = re.findall(r'<text [^>]* x="([\d.-]+)" y="([\d.-]+)"[^>]*>(mappo_l, critic_lr[^<]*)<', out.read_text())
     assert len(names) == 8 and len({y for _, y, _ in names}) == 8
     width = float(re.findall(r'width="([\d.]+)pt"', out.read_text())[0])

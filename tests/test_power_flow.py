@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import power_flow
 from envs.errors import TaskError
+from envs.voltage import power_flow
 
 RECORDED = Path(__file__).parent / "data" / "grid_powerflow_reference.npz"
 CASES = ("case33", "case141")

@@ -17,24 +17,28 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bench import publish, tables
-from pmt_jax import experiment, folder, learner, load_config, load_policy, normalise, numpy_policy, pretrained, setup
-from pmt_jax.checkpoint import Checkpoints
-from pmt_jax.types import ActingState, LearnerState, Moments, Trained
+from pmt_jax import load_config, load_policy, make_setup
+from pmt_jax.learning import learner
+from pmt_jax.learning.maths import running_moments
+from pmt_jax.learning.types import ActingState, LearnerState, RunningMoments, TrainState
+from pmt_jax.policies import evaluate, hub, numpy_policy
+from pmt_jax.training import run_folder
+from pmt_jax.training.checkpoint import Checkpoints
 
 ROOT = pathlib.Path(__file__).parent.parent
-NAMES = pretrained.names()
+NAMES = hub.names()
 
 
 @pytest.fixture
-def hub(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
+def empty_hub(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
     """An empty place for policies."""
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "hub")
+    monkeypatch.setattr(hub, "FOLDER", tmp_path / "hub")
     return tmp_path / "hub"
 
 
 def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, float]) -> pathlib.Path:
     """A run folder of seeds 3 and 4 on the lane, whose policies always do about the same: push so hard."""
-    run = setup(load_config("lane", method="r4sg", seeds=2, seed=3, num_envs=4, hidden=[8]))
+    run = make_setup(load_config("lane", method="r4sg", seeds=2, seed=3, num_envs=4, hidden=[8]))
     hyper, keys, axes = run.side_by_side
     state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
 
@@ -45,20 +49,20 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
         return dataclasses.replace(state, actor=dataclasses.replace(state.actor, params=params))
 
     out.mkdir()
-    folder.write_settings(out, run)
+    run_folder.write_settings(out, run)
     checkpoints = Checkpoints(out)
-    known = dataclasses.replace(folder.first_best(state), state=pushing(best))
+    known = dataclasses.replace(run_folder.first_best(state), state=pushing(best))
     checkpoints.save(100, {"last": pushing(last), "best": known})
     checkpoints.close()
     return out
 
 
-def test_the_best_policy_of_a_run_is_published_and_used_by_name(hub: pathlib.Path, tmp_path: pathlib.Path, cli):
+def test_the_best_policy_of_a_run_is_published_and_used_by_name(empty_hub: pathlib.Path, tmp_path: pathlib.Path, cli):
     # The lane's point comes to rest at twice the push; beyond 0.5 it costs, the nearer to 1 the better.
     out = untrained(tmp_path / "lane", last=(0.5, 0.0), best=(0.2, 0.1))
     facts = publish.publish(out, 8)
-    assert [p.relative_to(hub).as_posix() for p in hub.rglob("*.npz")] == ["lane-r4sg.npz"]
-    assert pretrained.about("hub:lane/r4sg") == facts
+    assert [p.relative_to(empty_hub).as_posix() for p in empty_hub.rglob("*.npz")] == ["lane-r4sg.npz"]
+    assert hub.about("hub:lane/r4sg") == facts
     assert (facts["seed"], facts["which"]) == (3, "best") and facts["figures"]["episode_cost"] == [0, 0]
 
     mean, half = facts["figures"]["episode_reward"]
@@ -83,9 +87,11 @@ def test_the_best_policy_of_a_run_is_published_and_used_by_name(hub: pathlib.Pat
 )
 def test_packing_loses_at_most_half_a_level_of_a_kernel_and_nothing_else(kernel: np.ndarray):
     rest = jnp.asarray(kernel[..., 0, :])
-    state = ActingState(Trained({"kernel": jnp.asarray(kernel), "bias": rest}, None), Moments(rest, rest, rest), rest)
-    packed = pretrained.rounded(state)
-    half = np.abs(kernel).max(-2, keepdims=True) / pretrained.LEVELS / 2
+    state = ActingState(
+        TrainState({"kernel": jnp.asarray(kernel), "bias": rest}, None), RunningMoments(rest, rest, rest), rest
+    )
+    packed = hub.rounded(state)
+    half = np.abs(kernel).max(-2, keepdims=True) / hub.LEVELS / 2
     assert (np.abs(packed.actor.params["kernel"] - kernel) <= half * (1 + 1e-4) + 1e-30).all()
     others = (packed.actor.params["bias"], packed.obs_moments, packed.update)
     assert all((x == rest).all() for x in jax.tree.leaves(others))
@@ -103,12 +109,12 @@ def test_packing_loses_at_most_half_a_level_of_a_kernel_and_nothing_else(kernel:
         (["render", "hub:lane/r4sg", "--seed", "7", "-o", "x.html"], "has no seed 7; it has 3"),
     ],
 )
-def test_names_that_are_none(arguments: list[str], says: str, hub: pathlib.Path, cli, tmp_path, monkeypatch):
-    run = setup(load_config("lane", hidden=[8]))
+def test_names_that_are_none(arguments: list[str], says: str, empty_hub: pathlib.Path, cli, tmp_path, monkeypatch):
+    run = make_setup(load_config("lane", hidden=[8]))
     actor = jax.vmap(run.nets.init_actor)(jax.random.split(jax.random.key(0), 1))
-    moments = jax.tree.map(lambda x: x[None], normalise.init((8,)))
-    state = ActingState(Trained(actor, None), moments, jnp.zeros(1, jnp.int32))
-    pretrained.save("hub:lane/r4sg", run.config, state, {"seed": 3})
+    moments = jax.tree.map(lambda x: x[None], running_moments.init((8,)))
+    state = ActingState(TrainState(actor, None), moments, jnp.zeros(1, jnp.int32))
+    hub.save("hub:lane/r4sg", run.config, state, {"seed": 3})
     monkeypatch.chdir(tmp_path)
     code, out, err = cli(*arguments)
     assert code == 2 and not out
@@ -122,8 +128,8 @@ def test_names_that_are_none(arguments: list[str], says: str, hub: pathlib.Path,
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_policy_of_the_package(name: str):
-    run, state = pretrained.load(name)
-    facts = pretrained.about(name)
+    run, state = hub.load(name)
+    facts = hub.about(name)
     assert f"hub:{run.config.task}/{run.config.method}" == name == f"hub:{facts['task']}/{facts['method']}"
     assert (run.config.seed, run.config.seeds, run.config.physics) == (facts["seed"], 1, "auto")
     assert run.cost_limit == facts["cost_limit"]
@@ -141,15 +147,15 @@ def test_what_is_told_about_them_and_how_large_they_are():
 def test_they_come_with_the_wheel():
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "pmt_jax.hub" in table["packages"]
-    inside = {file for pattern in table["package-data"]["pmt_jax.hub"] for file in pretrained.FOLDER.glob(pattern)}
-    assert inside >= {pretrained.file_of(name) for name in NAMES}
+    inside = {file for pattern in table["package-data"]["pmt_jax.hub"] for file in hub.FOLDER.glob(pattern)}
+    assert inside >= {hub.file_of(name) for name in NAMES}
 
 
 def test_packing_costs_no_reward_and_no_safety():
     """Of many 95 % intervals, a few may miss."""
     apart = []
     for name in NAMES:
-        facts = pretrained.about(name)
+        facts = hub.about(name)
         for figure, (before, half) in facts["unpacked"].items():
             after, other_half = facts["figures"][figure]
             apart.append(abs(after - before) > half + other_half)
@@ -159,16 +165,16 @@ def test_packing_costs_no_reward_and_no_safety():
 
 def test_a_trained_ant_runs_as_it_is_told():
     """Other episodes than the published ones, on the C engine: the two intervals meet."""
-    [row] = experiment.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")
-    (ours, half), told = row["episode_reward"], pretrained.about("hub:ant_2x4/mappo_l")["figures"]
+    [row] = evaluate.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")
+    (ours, half), told = row["episode_reward"], hub.about("hub:ant_2x4/mappo_l")["figures"]
     assert abs(ours - told["episode_reward"][0]) <= half + told["episode_reward"][1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_every_policy_is_as_good_as_it_is_told(name: str):
-    told = pretrained.about(name)
-    [row] = experiment.evaluate_run(pathlib.Path(name), told["episodes"], True)
+    told = hub.about(name)
+    [row] = evaluate.evaluate_run(pathlib.Path(name), told["episodes"], True)
     for figure in ("episode_reward", "episode_cost"):
         mean, half = told["figures"][figure]
         assert abs(row[figure][0] - mean) <= half + row[figure][1]

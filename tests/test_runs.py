@@ -21,10 +21,14 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmt_jax import checkpoint, doctor, experiment, load_config, load_policy, normalise, numpy_policy, setup, sinks
+from pmt_jax import load_config, load_policy, make_setup
+from pmt_jax.cli import doctor
 from pmt_jax.errors import UsageError
-from pmt_jax.evaluation import improves, interval
-from pmt_jax.policy import weights
+from pmt_jax.learning.evaluation import interval, is_better
+from pmt_jax.learning.maths import running_moments
+from pmt_jax.policies import load, numpy_policy
+from pmt_jax.policies.export import weights
+from pmt_jax.training import checkpoint, loggers, trainer
 
 STEPS = 1600
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
@@ -37,7 +41,7 @@ def rows(out: pathlib.Path) -> list[dict]:
 
 def saved(out: pathlib.Path) -> dict[str, np.ndarray]:
     """The whole content of a run's newest checkpoint: last and best."""
-    states = [checkpoint.pack(experiment.load_run(out, which)[1]) for which in ("last", "best")]
+    states = [checkpoint.pack(load.load_run(out, which)[1]) for which in ("last", "best")]
     return {f"{i}{path}": x for i, state in enumerate(states) for path, x in state.items()}
 
 
@@ -56,7 +60,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
     out = tmp_path_factory.mktemp("runs") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
         assert main([str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)]) == 0
     return out
 
@@ -89,7 +93,8 @@ def small_disk(tmp_path: pathlib.Path):
 
 DIES = """
 import os, signal, sys
-from pmt_jax import cli, experiment
+from pmt_jax.cli import main
+from pmt_jax.training import trainer
 experiment.CHECKPOINT_SECONDS = 0.0
 saves = 0
 
@@ -126,9 +131,9 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
 
 
 def test_sigterm_saves_and_says_how_to_go_on(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
-    write = sinks.Jsonl.write
+    write = loggers.Jsonl.write
     monkeypatch.setattr(
-        sinks.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(signal.SIGTERM))
+        loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(signal.SIGTERM))
     )
     out = tmp_path / "term"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
@@ -141,7 +146,7 @@ def test_sigterm_saves_and_says_how_to_go_on(whole: pathlib.Path, tmp_path: path
 
 
 def test_a_full_disk_stops_the_run_and_nothing_saved_is_lost(whole: pathlib.Path, small_disk, cli, monkeypatch):
-    monkeypatch.setattr(experiment, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
     place, remount = small_disk
     out = place / "run"
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
@@ -187,7 +192,7 @@ def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
 
 
 def test_a_checkpoint_from_before_a_task_told_more_is_still_good(whole: pathlib.Path):
-    state = experiment.load_run(whole)[1]
+    state = load.load_run(whole)[1]
     packed = checkpoint.pack(state)
     (told,) = [path for path in packed if ".env.info[" in path]
     older = {path: x for path, x in packed.items() if path != told}
@@ -274,7 +279,7 @@ figures = st.floats(-100, 100, width=32) | st.just(float("nan"))
 @given(reward=figures, cost=figures, best_reward=figures, best_cost=figures)
 def test_better_is_an_order(reward: float, cost: float, best_reward: float, best_cost: float):
     def better(a: tuple[float, float], b: tuple[float, float]) -> bool:
-        return bool(improves(*np.float32([*a, *b]), limit=1.0))
+        return bool(is_better(*np.float32([*a, *b]), limit=1.0))
 
     new, old = (reward, cost), (best_reward, best_cost)
     assert not better(new, new)
@@ -299,10 +304,10 @@ def test_the_interval_is_students():
 
 
 def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
-    run, state = experiment.load_run(whole)
+    run, state = load.load_run(whole)
     obs = jax.random.normal(jax.random.key(0), (5, 2, 8)) * 3
     moments, params = jax.tree.map(lambda x: x[1], (state.obs_moments, state.actor.params))
-    expected = run.nets.policies(params, normalise.normalise_obs(moments, obs))[0]
+    expected = run.nets.policies(params, running_moments.normalise_obs(moments, obs))[0]
     policy = load_policy(whole, seed=1)
     np.testing.assert_allclose(jax.jit(jax.vmap(policy))(obs), expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(policy(obs[2]), expected[2], rtol=1e-5, atol=1e-6)
@@ -336,9 +341,9 @@ def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     ],
 )
 def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pathlib.Path):
-    run = setup(load_config("lane", **{"hidden": [8], **changes}))
+    run = make_setup(load_config("lane", **{"hidden": [8], **changes}))
     noise = jax.random.normal(jax.random.key(1), (50, 8))
-    moments = normalise.accumulate(normalise.init((8,)), 3 * noise + 1)
+    moments = running_moments.accumulate(running_moments.init((8,)), 3 * noise + 1)
     params = jax.tree.map(lambda x: x + noise[0, 0], jax.jit(run.nets.init_actor)(jax.random.key(0)))
     np.savez(tmp_path / "policy.npz", **weights(run, params, moments))
     obs = 5 * jax.random.normal(jax.random.key(2), (4, 3, 2, 8))

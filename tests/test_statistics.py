@@ -11,7 +11,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pmt_jax import statistics
+from pmt_jax.studies import statistics
 
 scores = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=8)
 
@@ -79,5 +79,5 @@ def test_improvement_is_certain_where_every_run_is_better():
 
 
 def test_needs_no_jax():
-    code = "import pmt_jax.statistics, sys; assert 'jax' not in sys.modules"
+    code = "import pmt_jax.studies.statistics, sys; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -10,11 +10,14 @@ import signal
 import numpy as np
 import pytest
 
-from pmt_jax import checkpoint, experiment, load_config, sweep, table
-from pmt_jax.config import to_toml
+from pmt_jax import load_config
+from pmt_jax.config.settings import to_toml
 from pmt_jax.errors import UsageError
-from pmt_jax.folder import load_saved
-from pmt_jax.sinks import Jsonl
+from pmt_jax.policies import load
+from pmt_jax.studies import sweep, table
+from pmt_jax.training import checkpoint
+from pmt_jax.training.loggers import Jsonl
+from pmt_jax.training.run_folder import load_saved
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
 TINY += ("--epochs", 1, "--method", "happo", "--seeds", 2, "--steps", 600)
@@ -31,7 +34,7 @@ def without_seconds(log: list[dict]) -> list[dict]:
 
 
 def state(folder: pathlib.Path) -> dict[str, np.ndarray]:
-    return checkpoint.pack(experiment.load_run(folder)[1])
+    return checkpoint.pack(load.load_run(folder)[1])
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
+from pmt_jax.learning.maths.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
 
 G = jnp.asarray([-1.0, 0.0])
 
@@ -93,7 +93,7 @@ def test_line_search_takes_the_first_that_is_accepted():
 
 def test_gradients_and_curvature_of_a_linear_gaussian_policy():
     """N(theta, sd^2), A = a.u, A_c = a.w: the gradients of the surrogates are u and w, the curvature is 1/sd^2."""
-    from pmt_jax import distributions
+    from pmt_jax.learning.maths import distributions
 
     sd, rows = 0.3, 100_000
     u, w = jnp.asarray([1.0, -0.5]), jnp.asarray([0.3, 0.8])

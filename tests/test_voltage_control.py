@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import grid_data
 from envs.errors import TaskError
+from envs.voltage import profiles
 
 DATA = Path(__file__).parent / "data"
 FOLDER = DATA / "mapdn_format_case33"
@@ -175,7 +175,7 @@ def test_a_flow_without_solution_ends_the_episode_in_the_state_before() -> None:
 
 
 def test_barriers_are_as_specified() -> None:
-    from envs.voltage_control import barrier
+    from envs.voltage.control import barrier
 
     v = jnp.array([0.9, 0.9501, 0.99, 1.0, 1.04, 1.08])
     normal = np.exp(-0.5 * ((np.asarray(v) - 1) / 0.1) ** 2) / (0.1 * np.sqrt(2 * np.pi))
@@ -238,8 +238,8 @@ def test_profiles_in_the_package() -> None:
             np.testing.assert_allclose(env.s_max, table["s_max"], rtol=1e-6)
             assert profiles.days >= 365 and profiles.pv.min() == 0
             peak = profiles.p_load.sum(axis=1).max()
-            assert peak == pytest.approx(grid_data.PEAK_LOAD[data.split(":")[0], name])
-    again = grid_data.synthetic_profiles("case141", table, seed=3)
+            assert peak == pytest.approx(profiles.PEAK_LOAD[data.split(":")[0], name])
+    again = profiles.synthetic_profiles("case141", table, seed=3)
     np.testing.assert_array_equal(again.p_load, profiles.p_load)
 
 
@@ -250,22 +250,22 @@ def test_rows_between_knots_are_on_straight_lines(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows[0], knots[20], rtol=1e-6)
     np.testing.assert_allclose(rows[1], 0.6 * knots[20] + 0.4 * knots[21], rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(rows[2], knots[21], rtol=1e-6)
-    few = grid_data.Profiles(env.profiles.pv[:21], env.profiles.p_load[:21], env.profiles.q_load[:21], rows_per_knot=5)
+    few = profiles.Profiles(env.profiles.pv[:21], env.profiles.p_load[:21], env.profiles.q_load[:21], rows_per_knot=5)
     at = np.arange(few.num_rows) / 5
 
     def rows_of(x: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(at, np.arange(21), column) for column in x.T], axis=1)
 
-    dense = grid_data.Profiles(rows_of(few.pv), rows_of(few.p_load), rows_of(few.q_load))
+    dense = profiles.Profiles(rows_of(few.pv), rows_of(few.p_load), rows_of(few.q_load))
     np.testing.assert_allclose(few.row_std(), dense.row_std(), rtol=1e-9, atol=1e-12)
-    grid_data.save_profiles(tmp_path / "few.npz", dense)
-    back = grid_data.load_profiles(tmp_path / "few.npz", "case33", env.scenario.table)
+    profiles.save_profiles(tmp_path / "few.npz", dense)
+    back = profiles.load_profiles(tmp_path / "few.npz", "case33", env.scenario.table)
     assert back.rows_per_knot == 5
     np.testing.assert_allclose(back.p_load, few.p_load, atol=1e-12)
 
 
 def broken(tmp_path: Path, file: str, change) -> Path:
-    for name in grid_data.FILES:
+    for name in profiles.FILES:
         lines = (FOLDER / name).read_text().splitlines()[:700]
         (tmp_path / name).write_text("\n".join(change(lines) if name == file else lines) + "\n")
     return tmp_path
@@ -311,8 +311,8 @@ def test_the_141_bus_net_needs_its_own_folder() -> None:
 
 
 def test_baselines_order_as_they_should() -> None:
-    from envs.voltage_baselines import POLICIES
-    from pmt_jax.evaluation import play
+    from envs.voltage.baselines import POLICIES
+    from pmt_jax.learning.evaluation import play
 
     env = envs.make("voltage_33", episode_limit=11)
 

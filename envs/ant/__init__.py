@@ -1,0 +1,1 @@
+"""The ant in the corridor (Safe MAMuJoCo): model and task."""

@@ -1,0 +1,272 @@
+"""The ant in the zig-zag corridor of Safe Multi-Agent MuJoCo (Gu et al., 2023): tasks `ant_2x4` and `ant_4x2`.
+
+One ant of eight motors, shared out among 2 or 4 agents, runs along +x between two walls that zig-zag by 30 degrees.
+Written from the facts of the public reference code and checked against transitions recorded from it; paper and code
+differ in places, and then this is the code.
+
+Example:
+  >>> import jax, envs
+  >>> env = envs.make("ant_2x4")
+  >>> state = jax.jit(env.reset)(jax.random.key(0))
+  >>> state = jax.jit(env.step)(state, jax.numpy.zeros((2, 4)))
+  >>> state.obs.shape, state.cost.shape
+  ((2, 31), (2, 1))
+"""
+
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from ..base import EnvSpec, State
+from ..errors import one_of
+from ..physics import engines as _physics
+from ..physics.engines import PhysicsState
+
+MODEL = Path(__file__).parent / "ant_corridor.xml"
+SUBSTEPS = 5  # integration steps of 0.01 s in a control step
+CONTROL_DT = 0.05  # s
+HORIZON = 1000  # control steps
+COST_LIMIT = 10.0  # the benchmark's bound on an episode's summed cost
+COSTLY_GEOMS = ("floor", "torso_geom", "foot_1_geom", "foot_2_geom", "foot_3_geom", "foot_4_geom")  # see solver="fast"
+
+RESET_POSITION_NOISE = 0.1  # half-width of the uniform noise on every component of qpos, quaternion included
+RESET_VELOCITY_NOISE = 0.1  # standard deviation of the normal noise on qvel
+
+SLOPE = math.tan(math.radians(30.0))  # of the corridor's centre line, up or down
+FOLDS = (20.0, 60.0, 100.0)  # m along x, where the slope turns over; straight after the last
+HALF_WIDTH = 5.0  # m along y from the centre line to a wall
+DANGER = 1.8  # m along y to either side of a wall
+CONTROL_COST = 0.5
+CONTACT_COST = 0.5e-3
+SURVIVAL = 1.0
+HEIGHT = (0.2, 1.0)  # m, of the torso
+LEAST_UPRIGHT = -0.7  # cosine of the torso's tilt, 134 degrees
+
+COSTLY_ANT = (0.86, 0.16, 0.12, 1.0)  # what a picture shows at the moment of cost: the ant in red,
+COSTLY_BAND = 0.36  # and the danger bands less transparent
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Carry:
+    """What the ant remembers between control steps.
+
+    Attributes:
+      physics: the engine's state.
+      torso_xpos: [3] m, where the integrator's last stage saw the torso; the next forward reward starts from it.
+    """
+
+    physics: PhysicsState
+    torso_xpos: jax.Array
+
+
+@functools.cache
+def model() -> mujoco.MjModel:
+    """The compiled MJCF; engines copy it."""
+    return mujoco.MjModel.from_xml_path(str(MODEL))
+
+
+class AntCorridor:
+    """See the module; agents share reward, cost and (up to their own index) observation.
+
+    Args:
+      num_agents: 2 (four motors each: the two legs in front, the two behind) or 4 (one leg each: legs 4, 1, 2, 3). The
+        order is the one that the reference code effectively uses, not the one its partition table declares.
+      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics.engines`.
+      solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
+      observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
+        learners that keep running moments).
+      threads: of the `mujoco` engine; all usable CPUs where None.
+    """
+
+    def __init__(
+        self,
+        num_agents: int = 2,
+        *,
+        physics: str = "auto",
+        solver: str = "converged",
+        observation: str = "zscore",
+        threads: int | None = None,
+    ):
+        self._standardise = one_of("observation", observation, ("zscore", "raw")) == "zscore"
+        torso = model().body("torso").id
+        self._engine = _physics.make_engine(
+            model(),
+            substeps=SUBSTEPS,
+            readout={
+                "torso_xpos": ("xpos", torso),
+                "torso_xquat": ("xquat", torso),
+                "contact_force": ("cfrc_ext", slice(None)),
+            },
+            physics=physics,
+            solver=solver,
+            fast_contacts=COSTLY_GEOMS,
+            threads=threads,
+        )
+        self.engine = self._engine.name
+        action_dim = model().nu // num_agents
+        state_dim = model().nq - 2 + model().nv + 2
+        self.spec = EnvSpec(
+            name=f"ant_{num_agents}x{action_dim}",
+            num_agents=num_agents,
+            obs_dim=state_dim + num_agents,
+            action_dim=action_dim,
+            state_dim=state_dim,
+            num_costs=1,
+            horizon=HORIZON,
+            action_mask=np.ones((num_agents, action_dim), np.float32),
+            cost_limit=COST_LIMIT,
+        )
+
+    def reset(self, key: jax.Array) -> State:
+        """The ant near its reference pose at the corridor's start; the ankles begin outside their limits."""
+        position_key, velocity_key = jax.random.split(key)
+        start = self._engine.start()
+        qpos = start.qpos + jax.random.uniform(
+            position_key, start.qpos.shape, start.qpos.dtype, -RESET_POSITION_NOISE, RESET_POSITION_NOISE
+        )
+        qvel = RESET_VELOCITY_NOISE * jax.random.normal(velocity_key, start.qvel.shape, start.qvel.dtype)
+        quaternion = qpos[3:7] / jnp.linalg.norm(qpos[3:7])
+        return self._first(PhysicsState(qpos.at[3:7].set(quaternion), qvel, start.warmstart), qpos[:3])
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step of 0.05 s with `action` [N, A]; the motors saturate at 1, the control cost does not."""
+        carry: Carry = state.carry
+        ctrl = jnp.asarray(action, carry.torso_xpos.dtype).reshape(-1)  # agents in order fill the actuator vector
+        after, out = self._engine.step(carry.physics, ctrl)
+        reward, reward_parts = self._get_reward(carry.torso_xpos, out["torso_xpos"], ctrl, out["contact_force"])
+        terminated = self._get_termination(after, out["torso_xquat"])
+        cost, cost_parts = self._get_cost(out["torso_xpos"], terminated)
+        obs, global_state = self._get_obs(after)
+        info = reward_parts | cost_parts | _place(out["torso_xpos"]) | {"physics_overflow": out["overflow"]}
+        return State(obs, global_state, reward, cost, terminated, info, Carry(after, out["torso_xpos"]))
+
+    def restore(self, qpos: Any, qvel: Any, warmstart: Any = None, torso_xpos: Any = None) -> State:
+        """A State from MuJoCo's quantities.
+
+        Args:
+          qpos: [15] position, quaternion (w first; normalised if it is not), joint angles.
+          qvel: [14] velocities.
+          warmstart: [14] `qacc_warmstart`; zero where None.
+          torso_xpos: [3] where the last control step left the torso's `xpos`; qpos[:3] where None.
+        """
+        start = self._engine.start()
+        dtype = start.qpos.dtype
+        qpos, qvel = jnp.asarray(qpos, dtype), jnp.asarray(qvel, dtype)
+        warmstart = start.warmstart if warmstart is None else jnp.asarray(warmstart, dtype)
+        torso_xpos = qpos[:3] if torso_xpos is None else jnp.asarray(torso_xpos, dtype)
+        # A unit quaternion is left alone to the last bit, so that `raw` and `restore` are inverses.
+        norm = jnp.linalg.norm(qpos[3:7])
+        quaternion = jnp.where(jnp.abs(norm - 1.0) > 1e-5, qpos[3:7] / norm, qpos[3:7])
+        return self._first(PhysicsState(qpos.at[3:7].set(quaternion), qvel, warmstart), torso_xpos)
+
+    def raw(self, state: State) -> dict[str, jax.Array]:
+        """What `restore` takes."""
+        carry: Carry = state.carry
+        return {
+            "qpos": carry.physics.qpos,
+            "qvel": carry.physics.qvel,
+            "warmstart": carry.physics.warmstart,
+            "torso_xpos": carry.torso_xpos,
+        }
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What pictures are drawn from; its geoms include the walls and the danger bands."""
+        return model()
+
+    def decorate(self, scene: mujoco.MjvScene, raw: dict[str, np.ndarray], cost: float) -> None:
+        """Shows the moment of cost in a scene of `model`: a red ant, and bands that glow; see `envs.base`."""
+        del raw
+        if cost <= 0:
+            return
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
+                geom.rgba[:] = COSTLY_ANT
+            elif model().geom(geom.objid).name.startswith("danger"):
+                geom.rgba[3] = COSTLY_BAND
+
+    def _first(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
+        """A State that no transition led to."""
+        obs, global_state = self._get_obs(physics)
+        zero = jnp.zeros((), torso_xpos.dtype)
+        names = ("forward", "ctrl", "contact", "survive")
+        info = {f"reward_{name}": zero for name in names} | {"cost_obj": zero, "cost_done": zero}
+        info |= _place(torso_xpos) | {"physics_overflow": zero}
+        cost = jnp.zeros((self.spec.num_agents, 1), zero.dtype)
+        return State(obs, global_state, zero, cost, jnp.zeros((), bool), info, Carry(physics, torso_xpos))
+
+    def _get_obs(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
+        """Observations [N, 29 + N] and the raw state [29] they all contain; agents differ in the one-hot index only."""
+        qpos, qvel = physics.qpos, physics.qvel
+        place = jnp.stack([qpos[0] / 5.0, off_centre(qpos[0], qpos[1])])
+        raw = jnp.concatenate([qpos[2:], qvel, place])
+        num_agents = self.spec.num_agents
+        obs = jnp.concatenate(
+            [jnp.broadcast_to(raw, (num_agents, *raw.shape)), jnp.eye(num_agents, dtype=raw.dtype)], axis=1
+        )
+        if self._standardise:
+            obs = (obs - obs.mean(axis=1, keepdims=True)) / obs.std(axis=1, keepdims=True)
+        return obs, raw
+
+    def _get_reward(
+        self, before: jax.Array, after: jax.Array, ctrl: jax.Array, contact_force: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Speed along +x (m/s) less control and contact cost, plus 1 for being there: [] and its four addends."""
+        parts = {
+            "reward_forward": (after[0] - before[0]) / CONTROL_DT,
+            "reward_ctrl": -CONTROL_COST * jnp.sum(ctrl**2),
+            "reward_contact": -CONTACT_COST * jnp.sum(jnp.clip(contact_force, -1.0, 1.0) ** 2),
+            "reward_survive": jnp.full_like(after[0], SURVIVAL),
+        }
+        return jnp.sum(jnp.stack(list(parts.values()))), parts
+
+    def _get_cost(self, torso: jax.Array, terminated: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """1 within 1.8 m (along y) of either wall, on either side of it, or where the ant terminates: [N, 1]."""
+        danger = in_danger(torso[0], torso[1]).astype(torso.dtype)
+        ended = terminated.astype(torso.dtype)
+        cost = jnp.minimum(danger + ended, 1.0)
+        return jnp.full((self.spec.num_agents, 1), cost), {"cost_obj": danger, "cost_done": ended}
+
+    def _get_termination(self, physics: PhysicsState, torso_xquat: jax.Array) -> jax.Array:
+        """Whether the ant left the range of heights, turned over, or the physics broke."""
+        height = physics.qpos[2]
+        upright = 1.0 - 2.0 * (torso_xquat[1] ** 2 + torso_xquat[2] ** 2)
+        sound = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
+        return ~(sound & (height >= HEIGHT[0]) & (height <= HEIGHT[1]) & (upright >= LEAST_UPRIGHT))
+
+
+def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Signed distance (m) along y from the corridor's centre line.
+
+    At exactly x = 60 the reference code falls through to the straight part; that quirk is kept.
+    """
+    first, second, third = FOLDS
+    straight = first * SLOPE
+    centre = jnp.where(x < first, x * SLOPE, straight)
+    centre = jnp.where((x > first) & (x < second), (2 * first - x) * SLOPE, centre)
+    centre = jnp.where((x > second) & (x < third), (x - third + first) * SLOPE, centre)
+    return y - centre
+
+
+def _place(torso: jax.Array) -> dict[str, jax.Array]:
+    """How far the ant is along x (m), and 1 where it is outside: walls do not block, nor is it costly behind them."""
+    outside = jnp.abs(off_centre(torso[0], torso[1])) > HALF_WIDTH
+    return {"x_position": torso[0], "outside": outside.astype(torso.dtype)}
+
+
+def in_danger(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Whether a point lies in the band along either wall that costs."""
+    off = off_centre(x, y)
+    return jnp.minimum(jnp.abs(off - HALF_WIDTH), jnp.abs(off + HALF_WIDTH)) < DANGER

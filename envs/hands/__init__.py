@@ -1,0 +1,1 @@
+"""Two Shadow hands hand an object over (ShadowHandOver): models and task."""

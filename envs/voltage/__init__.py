@@ -1,0 +1,1 @@
+"""Voltage control on distribution grids: power flow, profiles, task, reference policies."""

@@ -1,0 +1,114 @@
+"""What every grid engineer compares with: doing nothing, chance, IEEE 1547 droop, and optimal dispatch.
+
+Each function makes a policy for an environment of `envs.voltage.control`: `policy(state) -> action` [N, 1], pure, to be
+jitted and vmapped like the environment itself.
+
+Example:
+  >>> import jax, envs
+  >>> env = envs.make("voltage_33")
+  >>> policy = droop(env)
+  >>> state = env.reset(jax.random.key(0))
+  >>> policy(state).shape
+  (6, 1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from ..base import State
+from .control import VoltageControl
+
+Policy = Callable[[State], jax.Array]
+
+# IEEE 1547-2018, category B: 44 % of the rating over 6 % of voltage. The standard's default curve has a dead band of
+# 2 % around nominal voltage, the baseline that is quoted for this benchmark has none.
+DROOP_SLOPE = 0.44 / 0.06
+DROOP_RESPONSE = 0.5  # share of the way to the curve in one control step; all of it would oscillate
+
+
+def zero(env: VoltageControl) -> Policy:
+    """No reactive power."""
+    return lambda state: jnp.zeros((env.spec.num_agents, 1), state.obs.dtype)
+
+
+def random(env: VoltageControl) -> Policy:
+    """Uniform in [-1, 1], drawn from the state's own key."""
+
+    def policy(state: State) -> jax.Array:
+        key = jax.random.fold_in(jax.random.fold_in(state.carry.key, state.carry.start_row), state.carry.steps)
+        return jax.random.uniform(key, (env.spec.num_agents, 1), state.obs.dtype, -1.0, 1.0)
+
+    return policy
+
+
+def droop(
+    env: VoltageControl,
+    slope: float = DROOP_SLOPE,
+    dead_band: float = 0.0,
+    largest_share: float = 1.0,
+    response: float = DROOP_RESPONSE,
+) -> Policy:
+    """Volt-var droop on each inverter's own voltage, followed with a first-order lag.
+
+    Args:
+      slope: reactive power per p.u. of voltage, as a share of the inverter's rating.
+      dead_band: p.u. around 1 without reactive power.
+      largest_share: of the rating, where the curve ends (0.44 in the standard); a, the action, ends at 1 anyway.
+      response: share of the way to the curve that one control step makes.
+    """
+    buses = jnp.asarray(env.scenario.table["pv_bus"])
+
+    def policy(state: State) -> jax.Array:
+        off = state.carry.vm_pu[buses] - 1
+        beyond = jnp.sign(off) * jnp.maximum(jnp.abs(off) - dead_band, 0)
+        target = -env.s_max * jnp.clip(slope * beyond, -largest_share, largest_share)
+        q = state.carry.q + response * (target - state.carry.q)
+        return q_to_action(env, state, q)
+
+    return policy
+
+
+def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: float = 20.0) -> Policy:
+    """Least line losses with voltages in the band, knowing the row to come and every bus: a bound, not a controller.
+
+    Adam on the actions through the differentiable power flow. Leaving the band costs `price` MW per p.u. and bus, from
+    `margin` p.u. inside of it on; so where the band cannot be kept, the violation is made small.
+    """
+    lower, upper = env.v_lower + margin, env.v_upper - margin
+
+    def objective(action: jax.Array, state: State) -> jax.Array:
+        flow = env.flow(state, action)
+        excess = jnp.maximum(flow.vm_pu - upper, 0) + jnp.maximum(lower - flow.vm_pu, 0)
+        return flow.line_loss_mw + price * jnp.sum(excess)
+
+    gradient = jax.grad(objective)
+
+    def policy(state: State) -> jax.Array:
+        def improve(i: jax.Array, c: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            action, mean, square = c
+            slope = jnp.nan_to_num(gradient(action, state))  # nan where the flow has no solution: stay
+            mean = 0.8 * mean + 0.2 * slope
+            square = 0.95 * square + 0.05 * slope**2
+            correction = jnp.sqrt(1 - 0.95 ** (i + 1.0)) / (1 - 0.8 ** (i + 1.0))
+            rate = 0.2 * (1 - i / iterations) ** 1.5
+            step = rate * correction * mean / (jnp.sqrt(square) + 1e-6)
+            return jnp.clip(action - step.astype(action.dtype), -1.0, 1.0), mean, square
+
+        start = jnp.clip(q_to_action(env, state, state.carry.q), -1.0, 1.0)
+        nothing = jnp.zeros_like(start)
+        return jax.lax.fori_loop(0, iterations, improve, (start, nothing, nothing))[0]
+
+    return policy
+
+
+POLICIES: dict[str, Callable[[VoltageControl], Policy]] = {"zero": zero, "random": random, "droop": droop, "opf": opf}
+
+
+def q_to_action(env: VoltageControl, state: State, q: jax.Array) -> jax.Array:
+    """[N, 1] the action that sets reactive powers `q` [N] MVAr in the next step; beyond [-1, 1] where it cannot."""
+    limit = env.scenario.action_scale * env.q_limit(state.carry.row)
+    return (q / jnp.maximum(limit, 1e-9))[:, None]

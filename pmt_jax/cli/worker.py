@@ -1,0 +1,34 @@
+"""The process that trains one program of a sweep: `python -m pmt_jax.cli.worker FOLDER OUT CACHE DEVICES`."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import signal
+import sys
+import threading
+
+from ..studies import sweep
+from .main import answer, say
+
+
+def _end_with_parent() -> None:
+    """Standard input ends when whoever started this process is gone, even by kill -9: save and end then."""
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def main() -> int:
+    """Trains the program of the arguments."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    folder, out, cache, count = sys.argv[1:]
+
+    def train() -> int:
+        devices = int(count) if count else None
+        return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
+
+    return answer("pmt", train)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

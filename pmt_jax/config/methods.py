@@ -1,0 +1,49 @@
+"""The table of methods: what makes each of them is data, not code.
+
+All methods are one learner (`pmt_jax.learning.learner`) with a few switches; nothing else asks for a method by name.
+Adding one is adding a row:
+
+  >>> METHODS["my_happo"] = Method(order="sequential", constraint="none")
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    import jax
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A point in the space of methods (specification, section 7).
+
+    Attributes:
+      order: `simultaneous` updates all agents at once; `sequential` updates them one after the other in random order,
+        each corrected by the factor M of those before it (HAPPO).
+      constraint: how the cost limit acts: `none`, a `lagrangian` multiplier per agent and cost, or a `trust_region`
+        whose step keeps within the limit (CPO).
+      cost_signal: what counts as danger in the cost advantage: the `cost` itself, the `fear` of it, or a function of
+        your own, Batch -> [T, B, N, K] (docs/tutorial.ipynb has one).
+      ratio_weight: what biases the probability ratio: nothing, or `regret`.
+      share_actor: one actor for all agents (needs equal action spaces and agent ids in the observation).
+    """
+
+    order: Literal["simultaneous", "sequential"]
+    constraint: Literal["none", "lagrangian", "trust_region"]
+    cost_signal: Literal["cost", "fear"] | Callable[[Any], jax.Array] = "cost"
+    ratio_weight: Literal["none", "regret"] = "none"
+    share_actor: bool = False
+
+
+METHODS: dict[str, Method] = {
+    "mappo": Method(order="simultaneous", constraint="none", share_actor=True),
+    "happo": Method(order="sequential", constraint="none"),
+    "mappo_l": Method(order="sequential", constraint="lagrangian"),
+    "macpo": Method(order="sequential", constraint="trust_region"),
+    "f4sg": Method(order="sequential", constraint="lagrangian", cost_signal="fear"),
+    "r4sg": Method(order="sequential", constraint="lagrangian", ratio_weight="regret"),
+    "mixed": Method(order="sequential", constraint="lagrangian", cost_signal="fear", ratio_weight="regret"),
+}

@@ -1,0 +1,103 @@
+"""How good and how safe a policy is: whole episodes under fixed keys, each environment's first episode only.
+
+Counting first episodes only keeps short episodes from being counted more often than long ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from .. import tasks
+from . import sharding
+from .setup import Setup
+from .types import ActingState, Metrics
+
+EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
+
+Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
+
+
+def evaluate(setup: Setup, state: ActingState, episodes: int, *, deterministic: bool) -> Metrics:
+    """Runs one seed's policy for `episodes` whole episodes.
+
+    Args:
+      run: the run's task and networks.
+      state: a learner state of one seed, or what of it acts.
+      episodes: environments, one episode each.
+      deterministic: take the mean action instead of a sample.
+
+    Returns:
+      The figures of `play`.
+    """
+    key = jax.random.key(EVALUATION_KEY)
+
+    def act(env: tasks.State, t: jax.Array) -> jax.Array:
+        mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, env.obs))
+        noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
+        return mean + std * noise
+
+    return play(setup.vector.env, act, episodes)
+
+
+def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
+    """`episodes` whole episodes of any policy, from starts that are always the same.
+
+    Returns:
+      episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
+      of the episode's steps with a cost above 0 for some agent) and the task's info (means over the episode), each
+      [episodes]; all undiscounted.
+    """
+    vector = tasks.VectorEnv(env, episodes)
+    mask = jnp.asarray(vector.spec.action_mask)
+    step_per_device = sharding.per_device(vector.step)
+
+    def step(
+        carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array
+    ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
+        state, alive, sums = carry
+        state, outcome = step_per_device(state, act(state.env, t) * mask)
+        cost = outcome.cost.sum(-1)
+        now = {
+            "episode_reward": outcome.reward,
+            "episode_cost": cost.mean(-1),
+            "episode_length": jnp.ones_like(outcome.reward),
+            "violation_rate": cost.max(-1) > 0,
+            **{f"info/{name}": x for name, x in outcome.info.items()},
+        }
+        sums = {name: sums[name] + alive * now[name] for name in sums}
+        return (state, alive & ~(outcome.terminated | outcome.truncated), sums), None
+
+    start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))
+    names = ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
+    names += [f"info/{name}" for name in start.env.info]
+    sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
+    carry = (start, jnp.ones(episodes, bool), sums)
+    (_, _, sums), _ = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
+    per_step = [name for name in sums if not name.startswith("episode_")]
+    return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}}
+
+
+def interval(x: np.ndarray) -> tuple[float, float]:
+    """Of independent figures [n]: the mean and the half-width of its 95 % interval (Student's t; nan for n = 1)."""
+    n = len(x)
+    if n == 1:
+        return float(x[0]), float("nan")
+    quantile = float(scipy.special.stdtrit(n - 1, 0.975))
+    return float(x.mean()), quantile * float(x.std(ddof=1)) / n**0.5
+
+
+def is_better(
+    reward: np.ndarray, cost: np.ndarray, best_reward: np.ndarray, best_cost: np.ndarray, limit: float | np.ndarray
+) -> np.ndarray:
+    """Whether a policy is better than the best so far: [...] bool, of mean episode rewards and costs [...].
+
+    Within the cost limit beats beyond it; within it the higher reward is better, beyond it the lower cost. Figures
+    that are nan (no episode ended) improve on nothing.
+    """
+    within, was_within = cost <= limit, best_cost <= limit
+    return np.where(within & was_within, reward > best_reward, np.where(was_within, False, cost < best_cost))

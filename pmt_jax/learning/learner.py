@@ -1,0 +1,214 @@
+"""One learner for all methods: an update reads from top to bottom like the paper's Algorithms 1 and 2."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from .. import tasks
+from ..config.settings import Config, Hyper
+from . import emotions, rollout
+from .maths import lagrangian, running_moments
+from .maths.advantages import gae
+from .maths.losses import value_loss
+from .optimise import fit, init_train_state
+from .policy_update import policy_rows, update_policies
+from .rollout import flatten_steps
+from .setup import Setup, make_setup
+from .types import Batch, Critic, LearnerState, Metrics, Params, Tag
+
+Train = Callable[..., tuple[LearnerState, Metrics]]
+
+
+def make_train(config: Config, env: tasks.Env | None = None) -> Train:
+    """The whole training as one pure function of a key; vmap it over keys to train seeds, over `hyper` to sweep.
+
+    Args:
+      config: the run's settings.
+      env: an environment of your own, in place of `config.task`.
+
+    Returns:
+      train: (key, hyper=the config's) -> (LearnerState, Metrics with a leading [updates]).
+
+    Example:
+      >>> from pmt_jax import load_config
+      >>> train = make_train(load_config("lane", num_envs=8, steps=200, log_interval=1))
+      >>> keys = jax.random.split(jax.random.key(0), 2)
+      >>> state, metrics = jax.jit(jax.vmap(train))(keys)
+      >>> metrics["violation_rate"].shape
+      (2, 1)
+    """
+    setup = make_setup(config, env)
+
+    def train(key: jax.Array, hyper: Hyper = setup.hyper) -> tuple[LearnerState, Metrics]:
+        return train_chunk(setup, hyper, init(setup, hyper, key), config.num_updates)
+
+    return train
+
+
+def train_chunk(setup: Setup, hyper: Hyper, state: LearnerState, updates: int) -> tuple[LearnerState, Metrics]:
+    """`updates` updates in one scan; metrics have a leading [updates]."""
+    return jax.lax.scan(lambda s, _: train_step(setup, hyper, s), state, length=updates)
+
+
+def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
+    """The state before the first update of the run that `key` names."""
+    spec = setup.vector.spec
+    tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
+    heads = (spec.num_agents, spec.num_costs)
+    constrained = setup.method.constraint == "lagrangian"
+    return LearnerState(
+        actor=jax.vmap(init_train_state)(setup.nets.init_actor(tagged[Tag.ACTOR])),
+        critic=Critic(init_train_state(setup.nets.init_critic(tagged[Tag.CRITIC])), running_moments.init(())),
+        cost_critic=Critic(
+            init_train_state(setup.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), running_moments.init(heads)
+        ),
+        fear=init_train_state(setup.nets.init_fear(tagged[Tag.FEAR])) if setup.method.cost_signal == "fear" else None,
+        regret=(
+            jax.vmap(init_train_state)(setup.nets.init_regret(tagged[Tag.REGRET]))
+            if setup.method.ratio_weight == "regret"
+            else None
+        ),
+        multiplier=jnp.full(heads, hyper.lambda_init * constrained),
+        episode_cost=jnp.full(heads, hyper.cost_limit),
+        obs_moments=running_moments.init((spec.obs_dim,)),
+        state_moments=running_moments.init((spec.state_dim,)),
+        rollout=rollout.start(setup.vector, tagged[Tag.ENV]),
+        key=tagged[Tag.UPDATE],
+        update=jnp.zeros((), jnp.int32),
+    )
+
+
+def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
+    """One update: act, appraise, estimate advantages, fit the critics, cope."""
+    key = jax.random.fold_in(state.key, state.update)
+    tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
+    hyper = _annealed(setup, hyper, state.update)
+
+    # 1 Information source: the team acts.
+    state, batch = _act(setup, state, tagged[Tag.ACTION])
+
+    # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
+    fear, cost_signal, fear_metrics = emotions.appraise_fear(setup, hyper, state.fear, batch, tagged[Tag.FEAR])
+    regret, log_weight, regret_metrics = emotions.appraise_regret(setup, hyper, state.regret, batch, tagged[Tag.REGRET])
+
+    # 3 Advantages of reward and of danger.
+    value, next_value = _values(state.critic, setup.nets.value, batch)
+    cost_value, next_cost_value = _values(state.cost_critic, setup.nets.cost_value, batch)
+    ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
+    advantage, returns = gae(batch.reward, value, next_value, *ends)
+    cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
+
+    # 4 Critics.
+    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    fit_critic = functools.partial(_fit_critic, setup, hyper)
+    critic, critic_metrics = fit_critic(state.critic, setup.nets.value, rows, tagged[Tag.CRITIC])
+    cost_critic, cost_critic_metrics = fit_critic(
+        state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]
+    )
+
+    # 5 Coping response: every agent's policy, and the price of danger.
+    rows = policy_rows(setup, hyper, state, batch, advantage, cost_advantage, log_weight)
+    episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
+    cost_excess = lagrangian.cost_excess(episode_cost, hyper.cost_limit, setup.vector.horizon)
+    actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
+
+    state = dataclasses.replace(
+        state,
+        actor=actor,
+        critic=critic,
+        cost_critic=cost_critic,
+        fear=fear,
+        regret=regret,
+        multiplier=multiplier,
+        episode_cost=episode_cost,
+        update=state.update + 1,
+    )
+    return state, {
+        **rollout.summary(batch),
+        "lambda": multiplier.mean(),
+        "cost_excess": cost_excess.mean(),
+        **{f"critic/{k}": x for k, x in critic_metrics.items()},
+        **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
+        **{f"actor/{k}": x for k, x in actor_metrics.items()},
+        **{f"fear/{k}": x for k, x in fear_metrics.items()},
+        **{f"regret/{k}": x for k, x in regret_metrics.items()},
+    }
+
+
+def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
+    """`hyper` with the step sizes that are left after so many updates."""
+    left = jnp.exp2(-(update * setup.config.batch_size / hyper.lr_half_life))
+    rates = ("actor_lr", "critic_lr", "emotion_lr")
+    return dataclasses.replace(hyper, **{name: getattr(hyper, name) * left for name in rates})
+
+
+def _act(setup: Setup, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Batch]:
+    """Collects a batch with the moments of observations frozen, then adds what was seen to the moments."""
+    normalisers = (
+        functools.partial(setup.scale, state.obs_moments),
+        functools.partial(setup.scale, state.state_moments),
+    )
+    after, batch, (obs, global_state) = rollout.collect(
+        setup.vector,
+        state.rollout,
+        lambda obs: setup.nets.policies(state.actor.params, obs),
+        normalisers,
+        key,
+        setup.config.rollout_length,
+    )
+    moments = (
+        running_moments.accumulate(state.obs_moments, obs),
+        running_moments.accumulate(state.state_moments, global_state),
+    )
+    return dataclasses.replace(state, rollout=after, obs_moments=moments[0], state_moments=moments[1]), batch
+
+
+def _episode_cost(setup: Setup, hyper: Hyper, state: LearnerState, batch: Batch, cost_value: jax.Array) -> jax.Array:
+    """The undiscounted cost per episode [N, K] that the constraint is held against."""
+    horizon = setup.vector.horizon
+    if setup.config.cost_estimate == "critic":
+        return (1 - hyper.gamma) * horizon * cost_value.mean((0, 1))
+    return rollout.episode_cost_estimate(batch, state.episode_cost, setup.config.cost_estimate, horizon)
+
+
+ValueFn = Callable[[Params, jax.Array], jax.Array]
+
+
+def _values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array, jax.Array]:
+    """Values of the states and of the true next states [T, B, ...], in the signal's unit."""
+    both = value_fn(critic.net.params, jnp.stack([batch.state, batch.next_state]))
+    value, next_value = running_moments.denormalise(critic.returns, both)
+    return value, next_value
+
+
+def _fit_critic(
+    setup: Setup,
+    hyper: Hyper,
+    critic: Critic,
+    value_fn: ValueFn,
+    rows: tuple[jax.Array, jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[Critic, Metrics]:
+    """Updates the moments of the returns once, then fits the critic to them in the new units.
+
+    Args:
+      rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+    """
+    state, old_value, returns = rows
+    moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
+    normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
+
+    def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, old, target = minibatch
+        return value_loss(value_fn(params, state), old, target, hyper.clip).mean(), {}
+
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": hyper.critic_lr, "max_grad_norm": hyper.max_grad_norm}
+    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
+    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
+    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}

@@ -1,0 +1,42 @@
+"""The price of danger: how far the cost is from its limit, and the multiplier that answers."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def cost_excess(episode_cost: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
+    """How far the cost is beyond its limit, as cost per step: S = (J - d) / L; positive is too dangerous (Eq. 11).
+
+    Args:
+      episode_cost: J [...], undiscounted cost per episode; cost_limit: d in the same unit; horizon: L, in steps.
+    """
+    return (episode_cost - cost_limit) / horizon
+
+
+def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: jax.Array) -> jax.Array:
+    """The change in cost per step that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
+
+    Args:
+      log_ratio, log_weight: [R], after the update; cost_advantage: [R, K], centred.
+
+    Returns:
+      [K].
+    """
+    return jnp.mean(jnp.exp(log_ratio + log_weight)[:, None] * cost_advantage, axis=0)
+
+
+def dual_update(
+    multiplier: jax.Array,
+    cost_excess: jax.Array,
+    surrogate: jax.Array,
+    lambda_lr: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """One projected gradient step of the multiplier: lambda <- clip(lambda + alpha (S + I), 0, lambda_max) (Eq. 17).
+
+    Args:
+      multiplier: [...], lambda; violation: S [...] and surrogate: I [...], both in cost per step.
+    """
+    return jnp.clip(multiplier + lambda_lr * (cost_excess + surrogate), 0.0, lambda_max)

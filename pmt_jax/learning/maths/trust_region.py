@@ -1,0 +1,141 @@
+"""A constrained trust-region step (CPO; MACPO takes one per agent): conjugate gradient, exact dual, line search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .pytree import pytree
+
+EPS = 1e-8
+LINE_SEARCH_STEPS = 10
+
+Hvp = Callable[[jax.Array], jax.Array]
+
+
+@pytree
+class Direction:
+    """step [P], and which of the five cases it came from (see `constrained_direction`)."""
+
+    step: jax.Array
+    case: jax.Array
+
+
+def conjugate_gradient(hvp: Hvp, b: jax.Array, iterations: int = 10, tolerance: float = 1e-10) -> jax.Array:
+    """Solves H x = b [P] for symmetric positive definite H, given v -> H v; stops early at a squared residual of
+    `tolerance`."""
+
+    def proceed(carry: tuple[Any, ...]) -> jax.Array:
+        count, _, _, _, rr = carry
+        return (count < iterations) & (rr > tolerance)
+
+    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        count, x, r, p, rr = carry
+        hp = hvp(p)
+        alpha = rr / (p @ hp + 1e-12)
+        x, r = x + alpha * p, r - alpha * hp
+        new = r @ r
+        return count + 1, x, r, r + new / (rr + 1e-12) * p, new
+
+    start = (jnp.int32(0), jnp.zeros_like(b), b, b, b @ b)
+    return jax.lax.while_loop(proceed, body, start)[1]
+
+
+def solve(hvp: Hvp, b: jax.Array, uncoupled: jax.Array | None = None) -> jax.Array:
+    """x [P] with H x = b: exact where `uncoupled`, by conjugate gradient elsewhere.
+
+    Ten iterations do not get as far as the deviations of a Gaussian: their curvature is small beside that of the
+    network that makes its mean, and a step four times too short along them was seen.
+
+    Args:
+      uncoupled: [P] bool, entries whose rows of H are 0 but on the diagonal.
+    """
+    if uncoupled is None:
+        return conjugate_gradient(hvp, b)
+    diagonal = hvp(uncoupled.astype(b.dtype))
+    return jnp.where(uncoupled, b / (diagonal + 1e-12), conjugate_gradient(hvp, jnp.where(uncoupled, 0.0, b)))
+
+
+def constrained_direction(
+    g: jax.Array,
+    b: jax.Array,
+    c: jax.Array,
+    hvp: Hvp,
+    delta: jax.Array | float,
+    uncoupled: jax.Array | None = None,
+) -> Direction:
+    """The step x that minimises g.x subject to c + b.x <= 0 and x'Hx / 2 <= delta (Achiam et al., 2017).
+
+    | case | when | step |
+    |---|---|---|
+    | 4 | c < 0 and b = 0: nothing costs | natural gradient |
+    | 3 | c < 0 and the whole trust region is safe | natural gradient |
+    | 2 | c < 0, the limit cuts the trust region | both constraints, by their exact dual |
+    | 1 | c >= 0, the trust region reaches safety | both constraints, by their exact dual |
+    | 0 | c >= 0, safety is out of reach | straight towards it |
+
+    Args:
+      g, b: [P] gradients of what to minimise and of the cost; c: [] how far the cost is beyond its limit.
+      hvp: v -> H v; delta: the trust region, in nats; uncoupled: see `solve`.
+    """
+    v, w = solve(hvp, g, uncoupled), solve(hvp, b, uncoupled)
+    c = jnp.where(c == 0, EPS, c)
+    q, r, s = g @ v, g @ w, b @ w
+    # Rounding makes parallel g and b look anything from a little to not at all different; both end here.
+    a_ = jnp.maximum(q - r**2 / (s + EPS), 8 * jnp.finfo(q.dtype).eps * q)
+    b_ = 2 * delta - c**2 / (s + EPS)
+    no_cost = (b @ b <= EPS) & (c < 0)
+    case = jnp.where(no_cost, 4, jnp.where(c < 0, jnp.where(b_ < 0, 3, 2), jnp.where(b_ < 0, 0, 1)))
+    lam, nu = _dual(q, r, s, c, a_, b_, delta)
+    free = jnp.sqrt(jnp.maximum(q, 0.0) / (2 * delta))
+    lam, nu = jnp.where(case >= 3, free, lam), jnp.where(case >= 3, 0.0, nu)
+    # With nu > 0 this is -(v + nu w) / lam, rid of the cancellation between v and nu w.
+    across = v - r / (s + EPS) * w
+    optimal = jnp.where(nu > 0, -across / (lam + EPS) - c / (s + EPS) * w, -v / (lam + EPS))
+    recovery = -jnp.sqrt(2 * delta / (s + EPS)) * w
+    return Direction(jnp.where(case == 0, recovery, optimal), case)
+
+
+def _dual(
+    q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, a_: jax.Array, b_: jax.Array, delta: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """Multipliers of the trust region and of the cost in cases 1 and 2: the better of two regions of lambda."""
+    edge = jnp.maximum(r / c, 0.0)
+    inf = jnp.inf
+    low_a, high_a = jnp.where(c < 0, 0.0, edge), jnp.where(c < 0, edge, inf)
+    low_b, high_b = jnp.where(c < 0, edge, 0.0), jnp.where(c < 0, inf, edge)
+    lam_a = jnp.clip(jnp.sqrt(a_ / jnp.maximum(b_, EPS)), low_a, high_a)
+    lam_b = jnp.clip(jnp.sqrt(jnp.maximum(q, 0.0) / (2 * delta)), low_b, high_b)
+    f_a = -0.5 * (a_ / (lam_a + EPS) + b_ * lam_a) - r * c / (s + EPS)
+    f_b = -0.5 * (q / (lam_b + EPS) + 2 * delta * lam_b)
+    lam = jnp.where(f_a >= f_b, lam_a, lam_b)
+    return lam, jnp.maximum(lam * c - r, 0.0) / (s + EPS)
+
+
+def backtrack(
+    accept: Callable[[jax.Array], jax.Array],
+    start: jax.Array,
+    step: jax.Array,
+    first: jax.Array | float,
+    decay: jax.Array | float,
+) -> tuple[jax.Array, jax.Array]:
+    """The first accepted of start + first * decay^j * step, j = 0 .. 9, or `start` if none is.
+
+    Returns:
+      the point [P], and how many were tried in vain (10 if none was accepted).
+    """
+
+    def proceed(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        count, accepted = carry
+        return (count < LINE_SEARCH_STEPS) & ~accepted
+
+    def body(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        count, _ = carry
+        accepted = accept(start + first * decay**count * step)
+        return jnp.where(accepted, count, count + 1), accepted
+
+    count, accepted = jax.lax.while_loop(proceed, body, (jnp.int32(0), jnp.asarray(False)))
+    return jnp.where(accepted, start + first * decay**count * step, start), count

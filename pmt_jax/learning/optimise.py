@@ -1,0 +1,62 @@
+"""The one epochs-and-minibatches scan that every network is trained with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from . import sharding
+from .types import Metrics, Params, TrainState
+
+ADAM_EPS = 1e-5
+_ADAM = optax.scale_by_adam(eps=ADAM_EPS)
+
+Loss = Callable[[Params, Any], tuple[jax.Array, Metrics]]
+
+
+def init_train_state(params: Params) -> TrainState:
+    """`params` with a fresh optimiser."""
+    return TrainState(params, _ADAM.init(params))
+
+
+def fit(
+    net: TrainState,
+    loss: Loss,
+    rows: Any,
+    key: jax.Array,
+    *,
+    learning_rate: jax.Array | float,
+    max_grad_norm: jax.Array | float,
+    epochs: int,
+    minibatches: int,
+) -> tuple[TrainState, Metrics]:
+    """Minimises `loss` by Adam over shuffled minibatches: `epochs` passes of `minibatches` steps each.
+
+    Args:
+      net: weights and optimiser state.
+      loss: (params, minibatch) -> scalar and metrics; sees rows [R / minibatches, ...].
+      rows: pytree of [R, ...], R divisible by `minibatches`.
+      key: shuffles the rows anew in every epoch.
+
+    Returns:
+      The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
+    """
+    rows = sharding.replicate(rows)
+    count = jax.tree.leaves(rows)[0].shape[0]
+    shuffle = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(key, epochs))
+
+    def step(net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
+        minibatch = sharding.shard(jax.tree.map(lambda x: x[index], rows))
+        (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
+        norm = optax.tree.norm(gradient)
+        shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
+        direction, opt_state = _ADAM.update(jax.tree.map(lambda g: g * shrink, gradient), net.opt_state)
+        params = jax.tree.map(lambda p, d: p - learning_rate * d, net.params, direction)
+        return TrainState(params, opt_state), {"loss": value, "grad_norm": norm, **metrics}
+
+    net, metrics = jax.lax.scan(step, net, shuffle.reshape(epochs * minibatches, -1))
+    return net, jax.tree.map(lambda x: x[-minibatches:].mean(0), metrics)

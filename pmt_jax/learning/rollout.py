@@ -1,0 +1,141 @@
+"""Information source: the team acts in all environments for a while, and everything it saw is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from ..tasks import Outcome, State, VectorEnv
+from . import sharding
+from .maths import distributions
+from .types import Batch, RolloutState
+
+Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
+Normalise = Callable[[jax.Array], jax.Array]
+
+
+def start(vector: VectorEnv, key: jax.Array) -> RolloutState:
+    """Fresh episodes everywhere, nothing summed yet."""
+    spec = vector.spec
+    zero = jnp.zeros(vector.num_envs)
+    return RolloutState(
+        vector=vector.reset(key),
+        reward_sum=zero,
+        cost_sum=jnp.zeros((vector.num_envs, spec.num_agents, spec.num_costs)),
+        length=jnp.zeros(vector.num_envs, jnp.int32),
+    )
+
+
+def collect(
+    vector: VectorEnv,
+    state: RolloutState,
+    policy: Policy,
+    normalise: tuple[Normalise, Normalise],
+    key: jax.Array,
+    steps: int,
+) -> tuple[RolloutState, Batch, tuple[jax.Array, jax.Array]]:
+    """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
+
+    Args:
+      policy: of normalised observations.
+      normalise: for observations and for global states.
+
+    Returns:
+      the state to go on from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
+    """
+    mask = jnp.asarray(vector.spec.action_mask)
+    normalise_obs, normalise_state = normalise
+    step_per_device = sharding.per_device(vector.step)
+
+    def step(state: RolloutState, t: jax.Array) -> tuple[RolloutState, tuple[Batch, tuple[jax.Array, jax.Array]]]:
+        env: State = state.vector.env
+        obs = normalise_obs(env.obs)
+        mean, std = policy(obs)
+        action = mean + std * jax.random.normal(jax.random.fold_in(key, t), mean.shape)
+        next_vector, outcome = step_per_device(state.vector, action * mask)
+        sums = RolloutState(
+            next_vector,
+            state.reward_sum + outcome.reward,
+            state.cost_sum + outcome.cost,
+            state.length + 1,
+        )
+        seen = {
+            "obs": obs,
+            "action": action,
+            "log_prob": distributions.log_prob(action, mean, std, mask),
+            "mean": mean,
+            "std": jnp.broadcast_to(std, mean.shape),
+            "state": normalise_state(env.global_state),
+            "next_state": normalise_state(outcome.next_global_state),
+        }
+        return _clear_finished(sums, outcome), (_record(seen, outcome, sums), (env.obs, env.global_state))
+
+    state, (batch, raw) = jax.lax.scan(step, state, jnp.arange(steps))
+    return state, batch, raw
+
+
+def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) -> Batch:
+    return Batch(
+        **seen,
+        reward=outcome.reward,
+        cost=outcome.cost,
+        terminated=outcome.terminated,
+        truncated=outcome.truncated,
+        info=outcome.info,
+        non_finite=outcome.non_finite,
+        episode_reward=sums.reward_sum,
+        episode_cost=sums.cost_sum,
+        episode_length=sums.length,
+    )
+
+
+def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
+    going = ~(outcome.terminated | outcome.truncated)
+    return RolloutState(sums.vector, sums.reward_sum * going, sums.cost_sum * going[:, None, None], sums.length * going)
+
+
+def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
+    """Mean of `x` [T, B, ...] over the steps that ended an episode; nan where none did."""
+    done = batch.done.reshape(batch.done.shape + (1,) * (x.ndim - 2))
+    return jnp.sum(x * done, (0, 1)) / done.sum()  # 0 / 0 is nan
+
+
+def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:
+    """The undiscounted cost per episode [N, K] that the multiplier answers to.
+
+    `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
+    times the horizon; no lag, for batches much shorter than an episode.
+    """
+    if how == "rate":
+        return horizon * batch.cost.mean((0, 1))
+    finished = finished_mean(batch, batch.episode_cost)
+    return jnp.where(batch.done.any(), finished, previous)
+
+
+def summary(batch: Batch) -> dict[str, jax.Array]:
+    """What happened, as scalars; episode figures are means over the episodes that ended (nan if none did).
+
+    episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
+    summed over K). violation_rate: share of steps with a cost above 0 for some agent. step_reward, step_cost: means
+    per step.
+    """
+    cost = batch.cost.sum(-1)
+    return {
+        "episode_reward": finished_mean(batch, batch.episode_reward),
+        "episode_cost": finished_mean(batch, batch.episode_cost.sum(-1).mean(-1)),
+        "episode_length": finished_mean(batch, batch.episode_length),
+        "episodes": batch.done.sum(),
+        "terminations": batch.terminated.sum(),
+        "violation_rate": (cost.max(-1) > 0).mean(),
+        "step_reward": batch.reward.mean(),
+        "step_cost": cost.mean(),
+        "non_finite": batch.non_finite.sum(),
+        **{f"info/{name}": x.mean() for name, x in batch.info.items()},
+    }
+
+
+def flatten_steps(x: jax.Array) -> jax.Array:
+    """[T, B, ...] as rows [R, ...]."""
+    return x.reshape(-1, *x.shape[2:])

@@ -1,0 +1,92 @@
+"""What is fixed before training begins."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import tasks
+from ..config.methods import METHODS, Method
+from ..config.settings import HYPER_FIELDS, Config, Hyper
+from . import networks
+from .maths import running_moments
+from .types import RunningMoments
+
+
+@dataclasses.dataclass(frozen=True)
+class Trials:
+    """What trains side by side in one program where it is more than the seeds of one run: a part of a sweep.
+
+    Attributes:
+      hyper: every lane's own settings, leaves [L], or [] where all share them; seed: [L] int32.
+    """
+
+    hyper: Hyper
+    seed: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
+
+    With `trials`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
+    With `mesh`, it is split over several devices (see devices.py).
+    """
+
+    config: Config
+    method: Method
+    vector: tasks.VectorEnv
+    nets: networks.Networks
+    trials: Trials | None = None
+    mesh: jax.sharding.Mesh | None = None
+
+    @property
+    def cost_limit(self) -> float:
+        """Allowed undiscounted cost of one agent per episode: the config's, or the task's where that is left open."""
+        limit = self.config.cost_limit
+        return self.vector.spec.cost_limit if math.isnan(limit) else limit
+
+    @property
+    def cost_limits(self) -> np.ndarray:
+        """`cost_limit` of everything that trains side by side: [config.seeds]."""
+        limits = self.trials.hyper.cost_limit if self.trials else self.cost_limit
+        return np.broadcast_to(np.asarray(limits), self.config.seeds)
+
+    def scale(self, moments: RunningMoments, x: jax.Array) -> jax.Array:
+        """Observations or states as the networks see them: scaled by running `moments` if the config says so."""
+        return running_moments.normalise_obs(moments, x) if self.config.obs_norm == "running" else x
+
+    @property
+    def hyper(self) -> Hyper:
+        """The numbers of `config` that are traced, as f32 scalars; a cost limit left open is the task's."""
+        values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": self.cost_limit}
+        traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+        return Hyper(**traced)
+
+    @property
+    def vmap_arguments(self) -> tuple[Hyper, jax.Array, tuple[int | None, int]]:
+        """What one program trains: settings (leaves [] or [seeds]), keys [seeds], and the axes that vmap maps over."""
+        keys = jax.vmap(jax.random.key)
+        if self.trials is None:
+            return self.hyper, keys(jnp.arange(self.config.seed, self.config.seed + self.config.seeds)), (None, 0)
+        return self.trials.hyper, keys(self.trials.seed), (0 if jnp.ndim(self.trials.hyper.clip) else None, 0)
+
+
+def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
+    """Builds the task and the networks of a run.
+
+    Args:
+      env: an environment of your own, in place of `config.task`.
+
+    Raises:
+      UsageError: unknown task or task option, or an engine that cannot run here.
+    """
+    method = METHODS[config.method]
+    env = env or tasks.make(config.task, config.physics, **dict(config.env))
+    nets = networks.build(config, env.spec, method.share_actor)
+    return Setup(config, method, tasks.VectorEnv(env, config.num_envs), nets)

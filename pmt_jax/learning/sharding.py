@@ -1,0 +1,130 @@
+"""How a run is split over devices: one mesh with the axes seed and env, and what the learner says to it.
+
+Seeds never talk to each other, so as many devices as possible share the seeds; the rest share each seed's environments.
+Environments step where they are (`apart`): physics engines are opaque to XLA's partitioner, which would hand every
+device all of them. The learner's rows are gathered once for each network's epochs (`shared`), every minibatch is cut
+into equal parts (`split`), and the partitioner sums the gradients. Random numbers do not depend on the split. Without a
+mesh these functions return what they are given, so that one device runs the program it would run without them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from ..config.settings import Config
+from ..errors import UsageError
+from .types import LearnerState
+
+SEED, ENV = "seed", "env"
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def make_mesh(config: Config, count: int | None) -> Mesh | None:
+    """The devices of a run as (seed, env); None where there is one.
+
+    Args:
+      count: how many, of all processes together; None takes one, or all where there are several processes.
+
+    Raises:
+      UsageError: there are fewer, or they cannot have equal parts of the seeds and environments.
+    """
+    present, processes = jax.devices(), jax.process_count()
+    if count is None:
+        count = len(present) if processes > 1 else 1
+    if count > len(present):
+        more = f"; XLA_FLAGS=--xla_force_host_platform_device_count={count} makes {count} of a CPU"
+        raise UsageError(
+            f"--devices {count}, but JAX sees {len(present)} {present[0].platform} device(s); take at most "
+            f"{len(present)}{more if present[0].platform == 'cpu' and processes == 1 else ''}"
+        )
+    if processes > 1 and count < len(present):
+        raise UsageError(
+            f"--devices {count}, but the {processes} processes bring {len(present)} devices, and all take part; "
+            "leave --devices out"
+        )
+    if count == 1:
+        return None
+    seeds = math.gcd(config.seeds, count)
+    _check_even(config, count, seeds)
+    # As inputs of what each device runs apart (`apart`), constants without entries, of which MJX-Warp has many, bring
+    # XLA's partitioner down (jaxlib 0.11.2); so constants stay where they are used.
+    jax.config.update("jax_use_simplified_jaxpr_constants", True)
+    axes = (AxisType.Auto, AxisType.Auto)
+    return jax.make_mesh((seeds, count // seeds), (SEED, ENV), axes, devices=present[:count])
+
+
+def _check_even(config: Config, count: int, seeds: int) -> None:
+    parts = count // seeds
+    numbers = {"--num-envs": config.num_envs} | (
+        {"--eval-episodes": config.eval_episodes} if config.eval_interval else {}
+    )
+    for flag, number in numbers.items():
+        if number % parts:
+            raise UsageError(
+                f"{count} devices take {config.seeds} seed(s) in {seeds} part(s) and {flag} {number} in {parts}, which "
+                f"is not even; choose a multiple of {parts}, other --seeds or other --devices"
+            )
+
+
+def use_mesh(mesh: Mesh | None) -> contextlib.AbstractContextManager[Any]:
+    """What is traced inside is for `mesh`."""
+    return contextlib.nullcontext() if mesh is None else jax.set_mesh(mesh)
+
+
+def placement(mesh: Mesh | None, state: LearnerState) -> LearnerState | None:
+    """Where each leaf of a state with a leading [seeds] belongs; None without a mesh, which lets JAX decide."""
+    if mesh is None:
+        return None
+    by_seed, by_env = NamedSharding(mesh, P(SEED)), NamedSharding(mesh, P(SEED, ENV))
+    everything = jax.tree.map(lambda _: by_seed, state)
+    return dataclasses.replace(everything, rollout=jax.tree.map(lambda _: by_env, state.rollout))
+
+
+def replicated(mesh: Mesh | None) -> NamedSharding | None:
+    """Whole on every device; None without a mesh, which lets JAX decide."""
+    return None if mesh is None else NamedSharding(mesh, P())
+
+
+def place(mesh: Mesh | None, state: LearnerState) -> LearnerState:
+    """Puts a state with a leading [seeds], the same in every process, where it belongs."""
+    return state if mesh is None else jax.jit(lambda x: x, out_shardings=placement(mesh, state))(state)
+
+
+def gather(tree: Any) -> Any:
+    """Arrays that lie partly in other processes, whole in each; all processes must call it."""
+    far = [x.sharding for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and not x.is_fully_addressable]
+    mesh = next((sharding.mesh for sharding in far if isinstance(sharding, NamedSharding)), None)
+    return tree if mesh is None else jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, P()))(tree)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Inside the program
+
+
+def per_device(function: F) -> F:
+    """`function` of pytrees with a leading [B], applied on each device to its own part of the environments."""
+    if _single_device():
+        return function
+    return jax.shard_map(function, in_specs=P(ENV), out_specs=P(ENV), check_vma=False)
+
+
+def shard(tree: Any) -> Any:
+    """Each device works on its part of the rows, the leaves' first axis."""
+    return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P(ENV))
+
+
+def replicate(tree: Any) -> Any:
+    """Every device has all of it: what is drawn from at random is gathered once, not once a draw."""
+    return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P())
+
+
+def _single_device() -> bool:
+    return jax.sharding.get_abstract_mesh().empty

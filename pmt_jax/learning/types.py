@@ -1,0 +1,186 @@
+"""Every pytree of the learner, once, with shapes.
+
+T time steps, B environments, N agents, O observation, A action, S state, K costs. Axes always come in this order.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..config.settings import HYPER_FIELDS, Hyper
+from ..tasks import VectorState
+from .maths.pytree import pytree
+from .maths.running_moments import RunningMoments
+
+Params = Any  # a pytree of network weights; for actors every leaf has a leading [N] ([1] where one actor is shared)
+
+jax.tree_util.register_dataclass(Hyper, data_fields=HYPER_FIELDS, meta_fields=())
+
+
+class Tag(enum.IntEnum):
+    """The consumers of randomness: each folds its tag into the update's key, so adding one moves no other."""
+
+    UPDATE = 0
+    ENV = 1
+    ACTION = 2
+    ORDER = 3
+    ACTOR = 4
+    CRITIC = 5
+    COST_CRITIC = 6
+    FEAR = 7
+    REGRET = 8
+
+
+@pytree
+class TrainState:
+    """A network in training: its weights and Adam's state."""
+
+    params: Params
+    opt_state: Any
+
+
+@pytree
+class Critic:
+    """A value function in training, with the moments of its returns (heads in their own, normalised units)."""
+
+    net: TrainState
+    returns: RunningMoments
+
+
+@pytree
+class RolloutState:
+    """What the collection of experience carries from one update to the next.
+
+    vector: B environments; reward_sum [B], cost_sum [B, N, K], length [B]: sums over the running episodes.
+    """
+
+    vector: VectorState
+    reward_sum: jax.Array
+    cost_sum: jax.Array
+    length: jax.Array
+
+
+@pytree
+class Batch:
+    """One update's experience; observations and states are normalised with the moments of its beginning.
+
+    Attributes:
+      obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
+        under the policy that acted; std: [T, B, N, A] likewise.
+      state, next_state: [T, B, S]; the next state is the one before any reset.
+      reward: [T, B]; cost: [T, B, N, K].
+      terminated, truncated: [T, B] bool, never both.
+      info: {name: [T, B]}.
+      non_finite: [T, B] bool, quarantined steps.
+      episode_reward: [T, B], episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to and with this step;
+        complete where the episode is done.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    state: jax.Array
+    next_state: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    info: dict[str, jax.Array]
+    non_finite: jax.Array
+    episode_reward: jax.Array
+    episode_cost: jax.Array
+    episode_length: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """[T, B] bool: the episode ended with this step, for whichever reason."""
+        return self.terminated | self.truncated
+
+
+@pytree
+class PolicyRows:
+    """What a policy is improved on; R = T * B rows, with a leading [N] before an agent is chosen.
+
+    Attributes:
+      obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
+      advantage: [R], hybrid: reward less weighted cost.
+      cost_advantage: [R, K], centred, in cost units.
+      log_weight: [R], bias on the probability ratio.
+      factor: [R], M: the probability ratios of the agents updated before.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    mask: jax.Array
+    log_prob: jax.Array
+    mean: jax.Array
+    std: jax.Array
+    advantage: jax.Array
+    cost_advantage: jax.Array
+    log_weight: jax.Array
+    factor: jax.Array
+
+
+@pytree
+class ActingState:
+    """What of a learner state acts: all that evaluations, pictures and exports need.
+
+    Attributes:
+      actor: weights with a leading agent axis.
+      obs_moments: [O], of raw observations.
+      update: [] int32, updates done.
+    """
+
+    actor: TrainState
+    obs_moments: RunningMoments
+    update: jax.Array
+
+
+@pytree
+class LearnerState(ActingState):
+    """All that training carries; saving it and loading it continues the run bit for bit.
+
+    Attributes:
+      actor, obs_moments, update: of ActingState.
+      critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
+      fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
+        that do not feel them.
+      multiplier: [N, K], lambda.
+      episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier answers to.
+      state_moments: [S], of raw states.
+      rollout: environments and running sums.
+      key: the run's key; update u draws from fold_in(key, u).
+    """
+
+    critic: Critic
+    cost_critic: Critic
+    fear: TrainState | None
+    regret: TrainState | None
+    multiplier: jax.Array
+    episode_cost: jax.Array
+    state_moments: RunningMoments
+    rollout: RolloutState
+    key: jax.Array
+
+
+@pytree
+class Best:
+    """Each seed's best learner state so far and the figures it was chosen by, with a leading [seeds].
+
+    Attributes:
+      state: the learner state.
+      reward, cost: [seeds] f32, mean episode reward and cost; -inf and inf where nothing is known yet.
+    """
+
+    state: LearnerState
+    reward: np.ndarray
+    cost: np.ndarray
+
+
+Metrics = dict[str, jax.Array]

@@ -1,0 +1,66 @@
+"""How good and how safe a trained team is: whole episodes under fixed keys, with intervals."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from .. import tasks
+from ..errors import UsageError
+from ..learning.evaluation import interval, play
+from ..learning.setup import Setup
+from ..learning.types import ActingState
+from ..training.compile import evaluate_seeds
+from ..training.run_folder import MATMUL_PRECISION, Say
+from ..training.trainer import NO_ROOM, OVERFLOW, seed_intervals
+from .load import load_run
+
+
+def evaluate_run(
+    out: pathlib.Path,
+    episodes: int,
+    deterministic: bool,
+    which: str = "last",
+    physics: str | None = None,
+    say: Say = print,
+) -> list[dict[str, Any]]:
+    """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
+
+    Args:
+      out: the run folder, which is only read, or the name of a pretrained policy.
+      deterministic: take mean actions instead of samples.
+      which: `last` or `best`.
+      physics: an engine other than the run's.
+    """
+    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic)
+
+
+def evaluate_states(setup: Setup, state: ActingState, episodes: int, deterministic: bool) -> list[dict[str, Any]]:
+    """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts."""
+    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
+    results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic))(state))
+    if np.any(results.get(OVERFLOW, 0) > 0):
+        raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
+    return [
+        {"seed": setup.config.seed + i, "cost_limit": setup.cost_limit, "step": step, **figures}
+        for i, (figures, step) in enumerate(zip(seed_intervals(results), _steps(setup, state), strict=True))
+    ]
+
+
+def _steps(setup: Setup, state: ActingState) -> list[int]:
+    return [int(update) * setup.config.batch_size for update in state.update]
+
+
+def evaluate_baseline(task: str, policy: str, episodes: int, options: dict[str, Any]) -> dict[str, Any]:
+    """Evaluates a policy that is not learned, over the same episodes as `evaluate_run`.
+
+    Raises:
+      UsageError: unknown task, option or policy.
+    """
+    env = tasks.make(task, **options)
+    act = jax.vmap(tasks.baseline(env, policy))
+    results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes))())
+    return {"cost_limit": env.spec.cost_limit, **{name: interval(x) for name, x in results.items()}}

@@ -1,0 +1,55 @@
+"""Trained policies without the training: as a function, and as files that need neither pmt_jax nor, if wished, JAX."""
+
+from __future__ import annotations
+
+import inspect
+import pathlib
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import UsageError
+from ..learning.maths import running_moments
+from ..learning.setup import Setup
+from ..learning.types import Params, RunningMoments
+from . import numpy_policy
+from .load import policy_function, state_of_seed
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
+
+def export_policy(folder: str | pathlib.Path, out: pathlib.Path, seed: int | None = None, which: str = "last") -> None:
+    """Writes a run's policy into the folder `out`, three files:
+
+    policy.stablehlo: `jax.export` of obs [batch, N, O] -> action [batch, N, A], f32, for CPU, CUDA, ROCm and TPU;
+    policy.npz: its weights; numpy_policy.py: a loader of these in NumPy alone.
+
+    Raises:
+      UsageError: as `load_policy`, or `out` cannot be written.
+    """
+    setup, state = state_of_seed(folder, seed, which)
+    spec = setup.vector.spec
+    batch = jax.export.symbolic_shape(f"batch, {spec.num_agents}, {spec.obs_dim}")
+    program = jax.jit(jax.vmap(policy_function(setup, state)))
+    exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(batch, jnp.float32))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "policy.stablehlo").write_bytes(exported.serialize())
+        np.savez(out / "policy.npz", **weights(setup, state.actor.params, state.obs_moments))  # pyright: ignore[reportArgumentType] (its stub)
+        (out / "numpy_policy.py").write_text(inspect.getsource(numpy_policy))
+    except OSError as error:
+        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another folder") from None
+
+
+def weights(setup: Setup, params: Params, moments: RunningMoments) -> dict[str, np.ndarray]:
+    """One seed's policy as the arrays that `numpy_policy.load` reads."""
+    if setup.config.obs_norm == "running":
+        mean, scale, bound = running_moments.obs_scaling(moments)
+    else:
+        mean, scale, bound = jnp.zeros(setup.nets.obs_dim), jnp.ones(setup.nets.obs_dim), jnp.float32(jnp.inf)
+    mask = setup.vector.spec.action_mask.astype(np.float32)
+    named = {"obs_mean": mean, "obs_scale": scale, "obs_clip": bound, "action_mask": mask}
+    named |= {"activation": np.asarray(setup.config.activation), **setup.nets.layers(params)}
+    return {name: np.asarray(x) for name, x in named.items()}

@@ -1,0 +1,84 @@
+"""A trained team from its run folder or from the hub: as a learner state, and as a pure function."""
+
+from __future__ import annotations
+
+import pathlib
+import warnings
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from ..errors import UsageError
+from ..learning.setup import Setup
+from ..learning.types import ActingState
+from ..tasks import did_you_mean
+from ..training.run_folder import MATMUL_PRECISION, load_saved
+from . import hub
+
+WHICH = ("last", "best")
+
+Policy = Callable[[jax.Array], jax.Array]
+
+
+def load_run(
+    folder: pathlib.Path,
+    which: str = "last",
+    physics: str | None = None,
+    warn: Callable[[str], object] = warnings.warn,
+) -> tuple[Setup, ActingState]:
+    """A run's settings and a learner state of it, with a leading [seeds].
+
+    Args:
+      folder: the run folder, or the name of a pretrained policy, of which there is but what acts of one seed.
+      which: `last`, or `best`: each seed's own best (see docs/runs.md).
+      physics: an engine other than the run's.
+      warn: told of damaged checkpoints, which are passed over.
+
+    Raises:
+      UsageError: the folder holds no run, or no checkpoint; or there is no such policy.
+    """
+    if which not in WHICH:
+        raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
+    if hub.is_name(folder):
+        return hub.load(str(folder), physics)
+    setup, _, saved = load_saved(folder, physics, warn)
+    return setup, saved["last"] if which == "last" else saved["best"].state
+
+
+def load_policy(folder: str | pathlib.Path, seed: int | None = None, which: str = "last") -> Policy:
+    """A run's team policy as a pure function, to be jitted and vmapped at will.
+
+    Args:
+      folder: the run folder, which is only read, or the name of a pretrained policy: `hub:ant_2x4/r4sg`.
+      seed: one of the run's seeds; its first if None.
+      which: `last`, or `best`: the seed's own best (see docs/runs.md).
+
+    Returns:
+      policy: raw observations obs [N, O] -> mean action [N, A], 0 where an agent has no such entry. Observations are
+        normalised inside; the task clips actions by its own rule.
+
+    Raises:
+      UsageError: no run, no checkpoint, or no such seed.
+    """
+    return policy_function(*state_of_seed(folder, seed, which))
+
+
+def state_of_seed(folder: str | pathlib.Path, seed: int | None, which: str) -> tuple[Setup, ActingState]:
+    setup, states = load_run(pathlib.Path(folder), which, physics="auto")  # nothing will be simulated
+    first, count = setup.config.seed, setup.config.seeds
+    index = 0 if seed is None else seed - first
+    if not 0 <= index < count:
+        raise UsageError(f"{folder} holds seeds {first} to {first + count - 1}, not {seed}")
+    return setup, jax.tree.map(lambda x: x[index], states)
+
+
+def policy_function(setup: Setup, state: ActingState) -> Policy:
+    mask = jnp.asarray(setup.vector.spec.action_mask)
+
+    def policy(obs: jax.Array) -> jax.Array:
+        with jax.default_matmul_precision(MATMUL_PRECISION):
+            mean, _ = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, obs))
+        return mean * mask
+
+    return policy

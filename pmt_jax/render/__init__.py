@@ -1,0 +1,3 @@
+"""Pictures: episodes as films and pages, reports.
+
+Imports `studies` and what lies below it."""

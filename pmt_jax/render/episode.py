@@ -1,0 +1,135 @@
+"""One whole episode of a trained team, kept step by step: what pictures are made of."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import tasks
+from ..errors import UsageError
+from ..learning.evaluation import EVALUATION_KEY
+from ..learning.setup import Setup
+from ..learning.types import ActingState
+from ..policies.load import load_run
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """T control steps; entry 0 of every array is the moment after the reset.
+
+    Attributes:
+      env: the environment it was played in; method, seed: whose policy played.
+      cost_limit: on the episode's summed cost.
+      raw: {name: [T + 1, ...]}, the raw quantities of `env.raw` that are numbers.
+      step: [T + 1] control steps since the reset.
+      reward, cost: [T + 1] of the step that led to each moment; cost is the mean over agents, summed over costs.
+      reward_sum, cost_sum: [T + 1] of the episode so far.
+      info: {name: [T + 1]} the task's figures.
+    """
+
+    env: tasks.Env
+    method: str
+    seed: int
+    cost_limit: float
+    raw: dict[str, np.ndarray]
+    step: np.ndarray
+    reward: np.ndarray
+    cost: np.ndarray
+    reward_sum: np.ndarray
+    cost_sum: np.ndarray
+    info: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+    @property
+    def kind(self) -> str:
+        """How it can be drawn: a `scene` of MuJoCo bodies, a `map` of voltages, or `plain` figures over time."""
+        return "scene" if hasattr(self.env, "model") else "map" if hasattr(self.env, "scenario") else "plain"
+
+    def at(self, t: int) -> dict[str, np.ndarray]:
+        """The raw quantities of moment `t`."""
+        return {name: x[t] for name, x in self.raw.items()}
+
+    def cut(self, moments: slice) -> Episode:
+        """The part of it that pictures shall show; a cost between two moments counts at the later one."""
+        names = ("raw", "step", "reward", "reward_sum", "cost_sum", "info")
+        arrays = jax.tree.map(lambda x: x[moments], {name: getattr(self, name) for name in names})
+        kept = np.arange(len(self))[moments]
+        since = np.concatenate([kept[:1], kept[:-1] + 1])
+        cost = np.array([self.cost[a : b + 1].max() for a, b in zip(since, kept, strict=True)])
+        return dataclasses.replace(self, cost=cost, **arrays)
+
+
+def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, deterministic: bool = False) -> Episode:
+    """Plays one episode with the policy of a run folder.
+
+    Args:
+      folder: the run folder, or the name of a pretrained policy.
+      seed: of the run's seeds; its first where None.
+      number: which of the fixed starts.
+      deterministic: take the mean action instead of a sample.
+
+    Raises:
+      UsageError: the folder holds no run that can be loaded, or no such seed.
+    """
+    setup, state = load_run(folder)
+    first = setup.config.seed
+    seed = first if seed is None else seed
+    if not first <= seed < first + setup.config.seeds:
+        known = ", ".join(str(first + i) for i in range(setup.config.seeds))
+        raise UsageError(f"the run in {folder} has no seed {seed}; it has {known}")
+    one = jax.tree.map(lambda x: x[seed - first], state)
+    program = jax.jit(functools.partial(record, setup, deterministic=deterministic))
+    moments = jax.device_get(program(one, jnp.asarray(number)))
+    return _whole(setup, seed, moments)
+
+
+def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic: bool) -> dict[str, Any]:
+    """The moments of one episode up to its time limit, whether or not it ended before; pure.
+
+    Args:
+      state: a learner state of one seed, or what of it acts.
+      number: [] which of the fixed starts.
+
+    Returns:
+      raw, reward, cost, info, terminated with a leading [horizon + 1]; see `Episode`.
+    """
+    env = setup.vector.env
+    mask = jnp.asarray(env.spec.action_mask)
+    start_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(EVALUATION_KEY), number))
+
+    def moment(s: tasks.State) -> dict[str, Any]:
+        raw = {
+            k: x for k, x in env.raw(s).items() if x is not None and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        }
+        cost = s.cost.sum(-1).mean()
+        return {"raw": raw, "reward": s.reward, "cost": cost, "info": s.info, "terminated": s.terminated}
+
+    def step(s: tasks.State, t: jax.Array) -> tuple[tasks.State, dict[str, Any]]:
+        mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, s.obs[None]))
+        noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(noise_key, t), mean.shape)
+        after = env.step(s, (mean + std * noise)[0] * mask)
+        return after, moment(after)
+
+    start = env.reset(start_key)
+    _, later = jax.lax.scan(step, start, jnp.arange(setup.vector.horizon))
+    return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), moment(start), later)
+
+
+def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
+    """The moments up to the first termination, without those that are not finite (nothing can draw them)."""
+    floats = [x.reshape(len(x), -1) for x in moments["raw"].values() if np.issubdtype(x.dtype, np.floating)]
+    broken = np.asarray(~np.isfinite(np.concatenate(floats, axis=1)).all(axis=1))
+    ends = np.flatnonzero(moments.pop("terminated") & ~broken) + 1
+    length = min([len(broken), *ends[:1], *np.flatnonzero(broken)[:1]])
+    sums = {"reward_sum": moments["reward"].cumsum(), "cost_sum": moments["cost"].cumsum()}
+    steps = np.arange(len(broken))
+    whole = Episode(setup.vector.env, setup.config.method, seed, setup.cost_limit, step=steps, **moments, **sums)
+    return whole.cut(slice(length))

@@ -1,0 +1,153 @@
+"""A run folder: what may be written into it, what is in it, and whether a run may go on there."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import json
+import pathlib
+import platform
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..config.settings import Config, differences, load_config, to_toml
+from ..errors import UsageError
+from ..files import read_rows, replace_text
+from ..learning import learner
+from ..learning.setup import Setup, make_setup
+from ..learning.types import Best, LearnerState
+from .checkpoint import Checkpoints
+
+PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
+
+Say = Callable[[str], None]
+
+
+def open_folder(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> None:
+    """Makes sure that `out` can be written and is either empty or the run to resume; writes nothing but the folder.
+
+    Raises:
+      UsageError: it is not, or the run was made with other settings or another physics engine.
+    """
+    existing = out / "config.toml"
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file, not a folder; choose another --out")
+    if resume:
+        if not existing.is_file():
+            raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
+        _same_settings(load_config(existing), setup.config, out)
+        _same_machine(out, setup, say)
+    elif out.is_dir() and any(out.iterdir()):
+        what = "another run" if existing.exists() else "other files"
+        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".pmt-write-test"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another --out") from None
+
+
+def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
+    """Only `steps` may change when a run is continued."""
+    changed = {name: change for name, change in differences(old, new).items() if name != "steps"}
+    if changed:
+        difference = "".join(f"\n  {name}: {change}" for name, change in changed.items())
+        raise UsageError(
+            f"the run in {out} was made with other settings; resume it unchanged (only --steps may grow), or choose "
+            f"another --out:{difference}"
+        )
+
+
+def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
+    """Another engine computes another run; another device or version only loses the last bits, which is said."""
+    try:
+        old = json.loads((out / "versions.json").read_text())
+    except (OSError, ValueError):
+        say(f"{out / 'versions.json'} cannot be read: nobody can tell whether the run began with the same engine")
+        return
+    new = versions(setup)
+    if old.get("engine", new["engine"]) != new["engine"]:
+        raise UsageError(
+            f"the run in {out} was simulated by engine '{old['engine']}', but physics = {setup.config.physics} means "
+            f"'{new['engine']}' on this {new['device']}, whose numbers differ; resume it where '{old['engine']}' runs, "
+            "or choose another --out"
+        )
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    if changed:
+        say(f"since the run began there changed: {', '.join(changed)}; it goes on, but perhaps not bit for bit")
+
+
+def versions(setup: Setup) -> dict[str, Any]:
+    """What the numbers of a run depend on besides its settings."""
+    found: dict[str, Any] = {name: version(name) for name in PACKAGES}
+    found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
+    found |= {"devices": setup.mesh.size if setup.mesh else 1}
+    return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
+
+
+def version(package: str) -> str | None:
+    """A package's version, None where it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def write_settings(out: pathlib.Path, setup: Setup) -> None:
+    """Writes config.toml and versions.json."""
+    replace_text(out / "config.toml", to_toml(setup.config))
+    replace_text(out / "versions.json", json.dumps(versions(setup), indent=2) + "\n")
+
+
+def forget_rows_after(out: pathlib.Path, step: int, say: Say) -> float:
+    """Drops what was logged after the checkpoint that the run continues from, and what was cut off in mid-line.
+
+    Returns:
+      the seconds of training that the rows kept tell of.
+    """
+    metrics = out / "metrics.jsonl"
+    kept = [row for row in read_rows(metrics) if row["step"] <= step]
+    last, seconds = (kept[-1]["step"], kept[-1]["seconds"]) if kept else (0, 0.0)
+    if last < step:
+        say(f"{metrics} ends at step {last:,}, but the checkpoint is of step {step:,}: the rows between are lost")
+    if metrics.exists():
+        replace_text(metrics, "".join(json.dumps(row) + "\n" for row in kept))
+    return seconds
+
+
+def initial_best(state: LearnerState) -> Best:
+    """Before anything is known of a run of any number of seeds."""
+    nothing = np.full(state.update.shape, np.inf, np.float32)
+    return Best(jax.tree.map(jnp.copy, state), -nothing, nothing)
+
+
+def load_saved(
+    folder: pathlib.Path, physics: str | None = None, warn: Callable[[str], object] = warnings.warn
+) -> tuple[Setup, int, dict[str, Any]]:
+    """A run's settings, the step of its newest whole checkpoint, and all that it holds: `last` and `best`.
+
+    Raises:
+      UsageError: the folder holds no run, or no checkpoint.
+    """
+    if not (folder / "config.toml").is_file():
+        raise UsageError(f"{folder} is not a run folder: it has no config.toml")
+    if not (folder / "checkpoints").is_dir():
+        raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
+    config = load_config(folder / "config.toml")
+    setup = make_setup(config if physics is None else config.replace(physics=physics))
+    keys = jax.vmap(jax.random.key)(jnp.arange(config.seeds))
+    like = jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), (None, 0)), setup.hyper, keys)
+    checkpoints = Checkpoints(folder, read_only=True)
+    try:
+        step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
+    finally:
+        checkpoints.close()
+    return setup, step, saved
