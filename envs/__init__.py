@@ -20,17 +20,17 @@ __pmt__ = "pmt-jax"  # tells our `envs` from the unrelated package of that name 
 
 # name -> (module, class, the options that make this task of it)
 _TASKS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "ant_2x4": ("ant_corridor", "AntCorridor", {"num_agents": 2}),
-    "ant_4x2": ("ant_corridor", "AntCorridor", {"num_agents": 4}),
-    "hand_over_2x6": ("hand_over", "HandOver", {"variant": "2x6"}),
-    "hand_over_4x3": ("hand_over", "HandOver", {"variant": "4x3"}),
-    "hand_over_safe_joint": ("hand_over", "HandOver", {"variant": "safe_joint"}),
-    "hand_over_safe_finger": ("hand_over", "HandOver", {"variant": "safe_finger"}),
+    "ant_2x4": ("ant.corridor", "AntCorridor", {"num_agents": 2}),
+    "ant_4x2": ("ant.corridor", "AntCorridor", {"num_agents": 4}),
+    "hand_over_2x6": ("hands.hand_over", "HandOver", {"variant": "2x6"}),
+    "hand_over_4x3": ("hands.hand_over", "HandOver", {"variant": "4x3"}),
+    "hand_over_safe_joint": ("hands.hand_over", "HandOver", {"variant": "safe_joint"}),
+    "hand_over_safe_finger": ("hands.hand_over", "HandOver", {"variant": "safe_finger"}),
     "lane": ("toys", "Lane", {}),
     "switch": ("toys", "Switch", {}),
     "noisy": ("toys", "Noisy", {}),
-    "voltage_33": ("voltage_control", "VoltageControl", {"case": "case33"}),
-    "voltage_141": ("voltage_control", "VoltageControl", {"case": "case141"}),
+    "voltage_33": ("voltage.control", "VoltageControl", {"case": "case33"}),
+    "voltage_141": ("voltage.control", "VoltageControl", {"case": "case141"}),
 }
 
 

@@ -81,10 +81,10 @@ def baseline(env: Env, name: str) -> Callable[[State], jax.Array]:
       UsageError: unknown policy, or a task that has none.
     """
     package = _envs().__name__
-    grid = importlib.import_module(f"{package}.voltage_control")
+    grid = importlib.import_module(f"{package}.voltage.control")
     if not isinstance(env, grid.VoltageControl):
         raise UsageError(f"task '{env.spec.name}' has no baseline policies; the voltage tasks have")
-    known = importlib.import_module(f"{package}.voltage_baselines").POLICIES
+    known = importlib.import_module(f"{package}.voltage.baselines").POLICIES
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
     return known[name](env)

@@ -53,7 +53,7 @@ def train(count, task, **sizes):
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
-    from envs.physics.engines import engines
+    from envs.physics import engines
     physics.obstacle = lambda name: None
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}

@@ -20,7 +20,7 @@ import scipy.stats
 
 import envs
 from envs.ant import corridor
-from envs.physics.engines import engines
+from envs.physics import engines
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.physics.engines import host_call
+from envs.physics import host_call
 
 ROOT = Path(__file__).parents[1]
 
@@ -79,7 +79,7 @@ def test_wide_dtypes():
     done = run("""
         import jax, jax.numpy as jnp, numpy as np
         jax.config.update("jax_enable_x64", True)
-        from envs.physics.engines import host_call
+        from envs.physics import host_call
         def double(operand, result):
             result[:] = 2 * operand
         name = host_call.register(double)
@@ -158,7 +158,7 @@ def test_ctrl_c_in_mid_program_never_makes_numbers_up():
     done = run("""
         import signal, jax, jax.numpy as jnp, numpy as np
         jax.config.update("jax_cpu_enable_async_dispatch", False)  # programs run on the main thread
-        from envs.physics.engines import host_call
+        from envs.physics import host_call
         def strike(*_):
             raise KeyboardInterrupt
         signal.signal(signal.SIGALRM, strike)
@@ -198,7 +198,7 @@ import os, sys, threading
 if "{cpus}" == "one":
     os.sched_setaffinity(0, [sorted(os.sched_getaffinity(0))[0]])
 import jax, jax.numpy as jnp, numpy as np
-from envs.physics.engines import host_call
+from envs.physics import host_call
 def half(operand, result):
     result[:] = 0.5 * operand
 name = host_call.register(half)
@@ -236,7 +236,7 @@ def test_programs_with_calls_are_cached_on_disk(tmp_path):
         import jax, jax.numpy as jnp
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        from envs.physics.engines import host_call
+        from envs.physics import host_call
         events = []
         jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rsplit("/", 1)[1]))
         def triple(operand, result):

@@ -17,7 +17,7 @@ import pytest
 
 from envs.ant import corridor
 from envs.errors import TaskError
-from envs.physics.engines import engines
+from envs.physics import engines
 
 ROOT = Path(__file__).parents[1]
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
