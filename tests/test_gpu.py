@@ -10,7 +10,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ import scipy.stats
 import envs
 from envs.ant import corridor
 from envs.physics import engines
+from places import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play
@@ -28,8 +28,6 @@ from pmt_jax.training.run_folder import MATMUL_PRECISION
 
 pytestmark = pytest.mark.gpu
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(__file__).parent / "data"
 EPISODES = 1000
 
 

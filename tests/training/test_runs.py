@@ -95,7 +95,7 @@ DIES = """
 import os, signal, sys
 from pmt_jax.cli import main
 from pmt_jax.training import trainer
-experiment.CHECKPOINT_SECONDS = 0.0
+trainer.CHECKPOINT_SECONDS = 0.0
 saves = 0
 
 def die(event, arguments):
@@ -106,7 +106,7 @@ def die(event, arguments):
             os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(die)
-cli.main(sys.argv[1:])
+main(sys.argv[1:])
 """
 
 

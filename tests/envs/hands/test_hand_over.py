@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +16,10 @@ import envs
 from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
+from places import ROOT
 from pmt_jax import load_config, make_train
 
-CATCH = Path(__file__).parents[1] / "bench" / "results" / "hand_over_catch.json"
+CATCH = ROOT / "bench" / "results" / "hand_over_catch.json"
 COUNT = 1000  # starts of the session's batch; the action 0 is the middle of all ranges, a half-flexed hand
 
 

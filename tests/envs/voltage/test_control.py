@@ -13,8 +13,8 @@ import pytest
 import envs
 from envs.errors import TaskError
 from envs.voltage import profiles
+from places import DATA
 
-DATA = Path(__file__).parent / "data"
 FOLDER = DATA / "mapdn_format_case33"
 ROWS_A_DAY = 480
 

@@ -13,9 +13,9 @@ from scipy import stats
 
 from pmt_jax.learning.maths import distributions, lagrangian, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
-from pmt_jax.learning.maths.losses import clipped_surrogate, hybrid_advantage
+from pmt_jax.learning.maths.losses import clipped_surrogate, huber, hybrid_advantage, value_loss
 from pmt_jax.learning.networks import LayerNorm
-from pmt_jax.learning.optimise import fit, huber, init_train_state, value_loss
+from pmt_jax.learning.optimise import fit, init_train_state
 
 
 def column(x: list[float], dtype: type = float) -> jax.Array:

@@ -17,7 +17,7 @@ from envs.base import Env, State
 from envs.vector import VectorEnv
 
 BATCH = 4
-# Variants differ from hand_over_2x6 in numbers only, which tests/test_hand_over.py holds.
+# Variants differ from hand_over_2x6 in numbers only, which hands/test_hand_over.py holds.
 ALL = [name for name in envs.names() if not name.startswith("hand_over_") or name == "hand_over_2x6"]
 
 

@@ -8,9 +8,10 @@ import pathlib
 import pytest
 
 import envs
+from places import ROOT
 from pmt_jax import load_config
 
-EXAMPLE = pathlib.Path(__file__).parent.parent / "docs" / "examples" / "my_env.py"
+EXAMPLE = ROOT / "docs" / "examples" / "my_env.py"
 TINY = (
     "--method",
     "happo",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,9 @@ import pytest
 
 from envs.errors import TaskError
 from envs.voltage import power_flow
+from places import DATA
 
-RECORDED = Path(__file__).parent / "data" / "grid_powerflow_reference.npz"
+RECORDED = DATA / "grid_powerflow_reference.npz"
 CASES = ("case33", "case141")
 
 

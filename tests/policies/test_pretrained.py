@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bench import publish, tables
+from places import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments
@@ -25,7 +26,6 @@ from pmt_jax.policies import evaluate, hub, numpy_policy
 from pmt_jax.training import run_folder
 from pmt_jax.training.checkpoint import Checkpoints
 
-ROOT = pathlib.Path(__file__).parent.parent
 NAMES = hub.names()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,8 @@ from hypothesis import strategies as st
 import envs
 from envs.ant import corridor
 from envs.errors import TaskError
+from places import DATA
 
-DATA = Path(__file__).parent / "data"
 TOLERANCE = {"qpos": 5e-5, "qvel": 5e-3, "reward_contact": 1e-5, "reward": 2e-3, "torso_xpos": 5e-5}
 # Here the ant stands inside a wall, which turns it at 1e-3 rad/s for the control step. Ours are drawn only.
 WALL_OBS_TOLERANCE = 2e-3

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
+from places import ROOT
 from pmt_jax.config.methods import METHODS
 
-ROOT = pathlib.Path(__file__).parent.parent
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```python\n(.*?)```", re.DOTALL)

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 from envs.physics import host_call
-
-ROOT = Path(__file__).parents[1]
+from places import ROOT
 
 
 def run(script: str, timeout: float = 240.0, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -13,11 +13,10 @@ import types
 
 import pytest
 
+from places import ROOT
 from pmt_jax.policies import load
 from pmt_jax.studies import workers
 from pmt_jax.training import checkpoint
-
-ROOT = pathlib.Path(__file__).parents[1]
 
 
 def program(text: str) -> list[str]:
@@ -87,7 +86,7 @@ def end(number, _):
     sys.exit(128 + number)
 signal.signal(signal.SIGINT, end)
 signal.signal(signal.SIGTERM, end)
-threading.Thread(target=jobs._end_with_parent, daemon=True).start()
+threading.Thread(target=workers._end_with_parent, daemon=True).start()
 file.write_text("ready")
 while True:
     time.sleep(0.05)
@@ -101,7 +100,8 @@ while True:
 def test_programs_end_with_the_one_that_started_them(tmp_path: pathlib.Path, sent: int, heard: int):
     files = [tmp_path / "one", tmp_path / "two"]
     commands = [[sys.executable, "-c", WAITING, str(file)] for file in files]
-    script = f"import sys; from pmt_jax import jobs; sys.exit(jobs.run({commands!r} + [['never']], 2, print))"
+    script = "import sys; from pmt_jax.studies import workers; "
+    script += f"sys.exit(workers.run({commands!r} + [['never']], 2, print))"
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     until(lambda: all(file.exists() and file.read_text() == "ready" for file in files))
     os.kill(parent.pid, sent)

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 import pytest
 
+from places import ROOT
 from pmt_jax.policies import load
 from pmt_jax.training import checkpoint
 
-ROOT = pathlib.Path(__file__).parents[1]
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
 ARGUMENTS = ("train", "lane", "--num-envs", 4, *TINY, "--eval-interval", 2, "--eval-episodes", 2, "--seeds", 1)
 QUICK = "--xla_backend_optimization_level=0"  # compiles in half the time; what it computes is compared with its like
@@ -54,7 +54,7 @@ def train(count, task, **sizes):
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
     from envs.physics import engines
-    physics.obstacle = lambda name: None
+    engines.obstacle = lambda name: None
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
 apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))

@@ -14,7 +14,7 @@ import pytest
 
 import pmt_jax
 from pmt_jax.learning import emotions
-from pmt_jax.learning.maths.losses import regret_weight
+from pmt_jax.learning.emotions import regret_weight
 
 TOP = {"choose": "top", "regret_max": 0.9}
 
@@ -181,7 +181,7 @@ def test_regret_learns_how_deliberate_a_costly_action_was():
 @pytest.mark.parametrize("number", [3, 4, *range(8, 18)])
 def test_every_equation_is_one_function(number: int):
     named = []
-    for path in pathlib.Path(pmt_jax.__file__).parent.glob("*.py"):
+    for path in pathlib.Path(pmt_jax.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
                 for numbers in re.findall(r"Eq\. (\d+(?:, \d+)*)", ast.get_docstring(node) or ""):

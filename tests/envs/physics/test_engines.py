@@ -7,7 +7,6 @@ import sys
 import textwrap
 import threading
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,8 @@ import pytest
 from envs.ant import corridor
 from envs.errors import TaskError
 from envs.physics import engines
+from places import ROOT
 
-ROOT = Path(__file__).parents[1]
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 
 
