@@ -113,6 +113,27 @@ class VectorEnv:
         return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(self.env.reset)(key), env), lambda: env)
 
 
+def felt_cost(
+    cost: jax.Array, key: jax.Array, cost_seen: jax.Array | float, cost_false: jax.Array | float
+) -> jax.Array:
+    """The cost that a team notices: harm that is seldom felt, and false alarms.
+
+    A costly step is felt with probability `cost_seen`; a safe step (no cost for any agent) is felt as a cost of 1 for
+    all agents with probability `cost_false`. There is one draw an environment for the whole team. With 1 and 0 the
+    result is `cost`, bit for bit.
+
+    Args:
+      cost: [B, N, K], the true cost of one step; key: of this step's draws.
+
+    Returns:
+      [B, N, K].
+    """
+    draw = jax.random.uniform(key, cost.shape[:1])
+    costly = (cost > 0).any((-2, -1))
+    felt = _where(costly & (draw >= cost_seen), jnp.zeros_like(cost), cost)
+    return _where(~costly & (draw < cost_false), jnp.ones_like(cost), felt)
+
+
 def _finite(state: State) -> jax.Array:
     """[B] bool: every floating number of an environment's state is finite."""
     checks = [

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import jax
 
     from envs.base import Env, EnvSpec, State
-    from envs.vector import Outcome, VectorEnv, VectorState
+    from envs.vector import Outcome, VectorEnv, VectorState, felt_cost
 
 __all__ = [
     "Env",
@@ -26,6 +26,7 @@ __all__ = [
     "baseline",
     "did_you_mean",
     "engines",
+    "felt_cost",
     "is_file",
     "make",
     "names",
@@ -44,7 +45,7 @@ def _envs() -> types.ModuleType:
 
 
 _TYPES = {"Env": "base", "EnvSpec": "base", "State": "base"}
-_TYPES |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector"}
+_TYPES |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
 
 
 def __getattr__(name: str) -> Any:

@@ -39,6 +39,8 @@ class Hyper:
       entropy_coef: weight of the policy's entropy, in nats summed over action dimensions.
       value_norm_decay: how much of the running moments of returns survives an update.
       cost_limit: allowed undiscounted cost of one agent per episode; nan takes the task's own limit.
+      cost_seen: probability that a costly step is felt by the learner; the task's own limit is scaled with it.
+      cost_false: probability that a safe step is felt as costly.
       lambda_init: multiplier before the first update.
       lambda_lr: step of the multiplier per update, for a violation in cost per step.
       lambda_max: upper bound of the multiplier.
@@ -69,6 +71,8 @@ class Hyper:
     entropy_coef: float = 0.0
     value_norm_decay: float = 0.995
     cost_limit: float = math.nan
+    cost_seen: float = 1.0
+    cost_false: float = 0.0
     lambda_init: float = 0.78
     lambda_lr: float = 0.1
     lambda_max: float = 20.0
@@ -394,6 +398,10 @@ def _validate(config: Config) -> None:
         raise UsageError(f"kl_max must be a number of nats above 0, or inf, not {config.kl_max}")
     if not config.lr_half_life > 0:
         raise UsageError(f"lr_half_life must be a number of steps above 0, or inf, not {config.lr_half_life}")
+    if not 0 < config.cost_seen <= 1:
+        raise UsageError(f"cost_seen must be a probability above 0, not {config.cost_seen}")
+    if not 0 <= config.cost_false < 1:
+        raise UsageError(f"cost_false must lie in [0, 1), not {config.cost_false}")
     if not 0 <= config.regret_max < 1:
         raise UsageError(f"regret_max must lie in [0, 1), not {config.regret_max}")
     if config.batch_size % config.trust_steps:

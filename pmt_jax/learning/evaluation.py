@@ -14,26 +14,31 @@ import scipy.special
 
 from .. import tasks
 from . import sharding
+from .rollout import Feel
 from .setup import Setup
-from .types import ActingState, Metrics
+from .types import ActingState, Hyper, Metrics, Tag
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
 
 
-def evaluate(setup: Setup, state: ActingState, episodes: int, *, deterministic: bool) -> Metrics:
+def evaluate(
+    setup: Setup, state: ActingState, episodes: int, *, deterministic: bool, hyper: Hyper | None = None
+) -> Metrics:
     """Runs one seed's policy for `episodes` whole episodes.
 
     Args:
-      run: the run's task and networks.
+      setup: the run's task and networks.
       state: a learner state of one seed, or what of it acts.
       episodes: environments, one episode each.
       deterministic: take the mean action instead of a sample.
+      hyper: says what of the costs is felt; the setup's own if None.
 
     Returns:
-      The figures of `play`.
+      The metrics of `play`.
     """
+    felt = setup.hyper if hyper is None else hyper
     key = jax.random.key(EVALUATION_KEY)
 
     def act(env: tasks.State, t: jax.Array) -> jax.Array:
@@ -41,16 +46,24 @@ def evaluate(setup: Setup, state: ActingState, episodes: int, *, deterministic: 
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         return mean + std * noise
 
-    return play(setup.vector.env, act, episodes)
+    def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
+        step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
+        return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
+
+    return play(setup.vector.env, act, episodes, feel)
 
 
-def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
+def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost) -> Metrics:
     """`episodes` whole episodes of any policy, from starts that are always the same.
+
+    Args:
+      feel: what of a step's cost the team notices; all of it by default.
 
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
-      of the episode's steps with a cost above 0 for some agent) and the task's info (means over the episode), each
-      [episodes]; all undiscounted.
+      of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
+      what the costs were before `feel`) and the task's info (means over the episode), each [episodes]; all
+      undiscounted.
     """
     vector = tasks.VectorEnv(env, episodes)
     mask = jnp.asarray(vector.spec.action_mask)
@@ -61,12 +74,14 @@ def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
     ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
         state, alive, sums = carry
         state, outcome = step_per_device(state, act(state.env, t) * mask)
-        cost = outcome.cost.sum(-1)
+        cost, true_cost = feel(outcome.cost, t).sum(-1), outcome.cost.sum(-1)
         now = {
             "episode_reward": outcome.reward,
             "episode_cost": cost.mean(-1),
             "episode_length": jnp.ones_like(outcome.reward),
             "violation_rate": cost.max(-1) > 0,
+            "true_episode_cost": true_cost.mean(-1),
+            "true_violation_rate": true_cost.max(-1) > 0,
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
         sums = {name: sums[name] + alive * now[name] for name in sums}
@@ -74,11 +89,12 @@ def play(env: tasks.Env, act: Act, episodes: int) -> Metrics:
 
     start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))
     names = ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
+    names += ["true_episode_cost", "true_violation_rate"]
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
     carry = (start, jnp.ones(episodes, bool), sums)
     (_, _, sums), _ = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
-    per_step = [name for name in sums if not name.startswith("episode_")]
+    per_step = [name for name in sums if not name.removeprefix("true_").startswith("episode_")]
     return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}}
 
 

@@ -90,7 +90,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     hyper = _annealed(setup, hyper, state.update)
 
     # 1 Information source: the team acts.
-    state, batch = _act(setup, state, tagged[Tag.ACTION])
+    state, batch = _act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
     fear, cost_signal, fear_metrics = emotions.appraise_fear(setup, hyper, state.fear, batch, tagged[Tag.FEAR])
@@ -142,24 +142,30 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     """`hyper` with the step sizes that are left after so many updates."""
-    left = jnp.exp2(-(update * setup.config.batch_size / hyper.lr_half_life))
+    # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
+    left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
     rates = ("actor_lr", "critic_lr", "emotion_lr")
     return dataclasses.replace(hyper, **{name: getattr(hyper, name) * left for name in rates})
 
 
-def _act(setup: Setup, state: LearnerState, key: jax.Array) -> tuple[LearnerState, Batch]:
+def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:
     """Collects a batch with the moments of observations frozen, then adds what was seen to the moments."""
     normalisers = (
         functools.partial(setup.scale, state.obs_moments),
         functools.partial(setup.scale, state.state_moments),
     )
+
+    def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
+        return tasks.felt_cost(cost, jax.random.fold_in(tagged[Tag.FELT], t), hyper.cost_seen, hyper.cost_false)
+
     after, batch, (obs, global_state) = rollout.collect(
         setup.vector,
         state.rollout,
         lambda obs: setup.nets.policies(state.actor.params, obs),
         normalisers,
-        key,
+        tagged[Tag.ACTION],
         setup.config.rollout_length,
+        feel,
     )
     moments = (
         running_moments.accumulate(state.obs_moments, obs),

@@ -222,7 +222,10 @@ def _trust_region_steps(
 def _trust_region_step(
     setup: Setup, hyper: Hyper, start: jax.Array, unravel: Any, rows: PolicyRows, cost_excess: jax.Array
 ) -> tuple[jax.Array, Metrics]:
-    """One constrained step from the flat weights `start` [P]: direction, line search (specification, section 2.9)."""
+    """One constrained step from the flat weights `start` [P]: direction, line search.
+
+    This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
+    """
     rows = sharding.shard(rows)
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -233,7 +236,8 @@ def _trust_region_step(
     def objectives(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Loss and cost surrogates."""
         mean, std = policy(flat)
-        ratio = jnp.exp(distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob)
+        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
+        ratio = jnp.exp(log_ratio + rows.log_weight)  # weighted by regret as in Eq. 15
         return -jnp.mean(rows.factor * ratio * rows.advantage), jnp.mean(rows.factor * ratio * rows.cost_advantage)
 
     def divergence(flat: jax.Array) -> jax.Array:
@@ -244,7 +248,7 @@ def _trust_region_step(
     (g,), (b,) = pull((one, zero)), pull((zero, one))
     _, fisher = jax.linearize(jax.grad(divergence), start)
     # What the steps before this one are expected to have changed counts towards the limit.
-    c = cost_excess + cost0 - jnp.mean(rows.factor * rows.cost_advantage)
+    c = cost_excess + cost0 - jnp.mean(rows.factor * jnp.exp(rows.log_weight) * rows.cost_advantage)
     uncoupled, _ = ravel_pytree(setup.nets.is_std(unravel(start)))
     direction = trust_region.constrained_direction(
         g, b, c, lambda v: fisher(v) + hyper.damping * v, hyper.kl_limit, uncoupled

@@ -14,16 +14,19 @@ from .types import Batch, RolloutState
 
 Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
 Normalise = Callable[[jax.Array], jax.Array]
+Feel = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K] of a step, its number [] -> felt cost
 
 
 def start(vector: VectorEnv, key: jax.Array) -> RolloutState:
     """Fresh episodes everywhere, nothing summed yet."""
     spec = vector.spec
     zero = jnp.zeros(vector.num_envs)
+    zeros = jnp.zeros((vector.num_envs, spec.num_agents, spec.num_costs))
     return RolloutState(
         vector=vector.reset(key),
         reward_sum=zero,
-        cost_sum=jnp.zeros((vector.num_envs, spec.num_agents, spec.num_costs)),
+        cost_sum=zeros,
+        true_cost_sum=zeros,
         length=jnp.zeros(vector.num_envs, jnp.int32),
     )
 
@@ -35,12 +38,14 @@ def collect(
     normalise: tuple[Normalise, Normalise],
     key: jax.Array,
     steps: int,
+    feel: Feel = lambda cost, t: cost,
 ) -> tuple[RolloutState, Batch, tuple[jax.Array, jax.Array]]:
     """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
 
     Args:
       policy: of normalised observations.
       normalise: for observations and for global states.
+      feel: what of a step's cost the team notices; all of it by default.
 
     Returns:
       the state to go on from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
@@ -55,10 +60,12 @@ def collect(
         mean, std = policy(obs)
         action = mean + std * jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         next_vector, outcome = step_per_device(state.vector, action * mask)
+        felt = feel(outcome.cost, t)
         sums = RolloutState(
             next_vector,
             state.reward_sum + outcome.reward,
-            state.cost_sum + outcome.cost,
+            state.cost_sum + felt,
+            state.true_cost_sum + outcome.cost,
             state.length + 1,
         )
         seen = {
@@ -69,6 +76,7 @@ def collect(
             "std": jnp.broadcast_to(std, mean.shape),
             "state": normalise_state(env.global_state),
             "next_state": normalise_state(outcome.next_global_state),
+            "cost": felt,
         }
         return _clear_finished(sums, outcome), (_record(seen, outcome, sums), (env.obs, env.global_state))
 
@@ -80,20 +88,23 @@ def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) ->
     return Batch(
         **seen,
         reward=outcome.reward,
-        cost=outcome.cost,
+        true_cost=outcome.cost,
         terminated=outcome.terminated,
         truncated=outcome.truncated,
         info=outcome.info,
         non_finite=outcome.non_finite,
         episode_reward=sums.reward_sum,
         episode_cost=sums.cost_sum,
+        true_episode_cost=sums.true_cost_sum,
         episode_length=sums.length,
     )
 
 
 def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
     going = ~(outcome.terminated | outcome.truncated)
-    return RolloutState(sums.vector, sums.reward_sum * going, sums.cost_sum * going[:, None, None], sums.length * going)
+    each = going[:, None, None]
+    costs = (sums.cost_sum * each, sums.true_cost_sum * each)
+    return RolloutState(sums.vector, sums.reward_sum * going, *costs, sums.length * going)
 
 
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
@@ -119,9 +130,10 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
 
     episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
     summed over K). violation_rate: share of steps with a cost above 0 for some agent. step_reward, step_cost: means
-    per step.
+    per step. Costs are as felt; true_episode_cost, true_violation_rate and true_step_cost are the same of the true
+    costs (see `envs.vector.felt_cost`).
     """
-    cost = batch.cost.sum(-1)
+    cost, true_cost = batch.cost.sum(-1), batch.true_cost.sum(-1)
     return {
         "episode_reward": finished_mean(batch, batch.episode_reward),
         "episode_cost": finished_mean(batch, batch.episode_cost.sum(-1).mean(-1)),
@@ -131,6 +143,9 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "violation_rate": (cost.max(-1) > 0).mean(),
         "step_reward": batch.reward.mean(),
         "step_cost": cost.mean(),
+        "true_episode_cost": finished_mean(batch, batch.true_episode_cost.sum(-1).mean(-1)),
+        "true_violation_rate": (true_cost.max(-1) > 0).mean(),
+        "true_step_cost": true_cost.mean(),
         "non_finite": batch.non_finite.sum(),
         **{f"info/{name}": x.mean() for name, x in batch.info.items()},
     }

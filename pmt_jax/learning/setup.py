@@ -47,9 +47,16 @@ class Setup:
 
     @property
     def cost_limit(self) -> float:
-        """Allowed undiscounted cost of one agent per episode: the config's, or the task's where that is left open."""
-        limit = self.config.cost_limit
-        return self.vector.spec.cost_limit if math.isnan(limit) else limit
+        """Allowed undiscounted felt cost of one agent per episode.
+
+        The config's; where that is left open, what an episode that truly costs the task's limit d is expected to be
+        felt as: cost_seen d + cost_false (horizon - d).
+        """
+        config = self.config
+        if not math.isnan(config.cost_limit):
+            return config.cost_limit
+        limit = self.vector.spec.cost_limit
+        return config.cost_seen * limit + config.cost_false * (self.vector.horizon - limit)
 
     @property
     def cost_limits(self) -> np.ndarray:

@@ -33,6 +33,7 @@ class Tag(enum.IntEnum):
     COST_CRITIC = 6
     FEAR = 7
     REGRET = 8
+    FELT = 9
 
 
 @pytree
@@ -55,12 +56,14 @@ class Critic:
 class RolloutState:
     """What the collection of experience carries from one update to the next.
 
-    vector: B environments; reward_sum [B], cost_sum [B, N, K], length [B]: sums over the running episodes.
+    vector: B environments; reward_sum [B], cost_sum and true_cost_sum [B, N, K], length [B]: sums over the running
+    episodes.
     """
 
     vector: VectorState
     reward_sum: jax.Array
     cost_sum: jax.Array
+    true_cost_sum: jax.Array
     length: jax.Array
 
 
@@ -72,12 +75,12 @@ class Batch:
       obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
         under the policy that acted; std: [T, B, N, A] likewise.
       state, next_state: [T, B, S]; the next state is the one before any reset.
-      reward: [T, B]; cost: [T, B, N, K].
+      reward: [T, B]; cost: [T, B, N, K] as felt (see `envs.vector.felt_cost`); true_cost: the same as it was.
       terminated, truncated: [T, B] bool, never both.
       info: {name: [T, B]}.
       non_finite: [T, B] bool, quarantined steps.
-      episode_reward: [T, B], episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to and with this step;
-        complete where the episode is done.
+      episode_reward: [T, B], episode_cost and true_episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to
+        and with this step; complete where the episode is done.
     """
 
     obs: jax.Array
@@ -89,12 +92,14 @@ class Batch:
     next_state: jax.Array
     reward: jax.Array
     cost: jax.Array
+    true_cost: jax.Array
     terminated: jax.Array
     truncated: jax.Array
     info: dict[str, jax.Array]
     non_finite: jax.Array
     episode_reward: jax.Array
     episode_cost: jax.Array
+    true_episode_cost: jax.Array
     episode_length: jax.Array
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 from ..learning import learner, sharding
 from ..learning.evaluation import evaluate
 from ..learning.setup import Setup
-from ..learning.types import ActingState, LearnerState, Metrics
+from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 
 
 class Programs(NamedTuple):
@@ -93,8 +93,13 @@ def compile_run(setup: Setup, say: Callable[[str], None]) -> tuple[LearnerState,
 
 
 def evaluate_seeds(setup: Setup, episodes: int, deterministic: bool) -> Callable[[ActingState], Metrics]:
-    """`evaluate` of all seeds: state with a leading [seeds] -> figures [seeds, episodes]."""
-    return _over_seeds(setup, functools.partial(evaluate, setup, episodes=episodes, deterministic=deterministic), 0)
+    """`evaluate` of all seeds: state with a leading [seeds] -> metrics [seeds, episodes]."""
+    hyper, _, (axis, _) = setup.vmap_arguments
+
+    def one_seed(hyper: Hyper, state: ActingState) -> Metrics:
+        return evaluate(setup, state, episodes, deterministic=deterministic, hyper=hyper)
+
+    return functools.partial(_over_seeds(setup, one_seed, (axis, 0)), hyper)
 
 
 def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callable[..., Any]:

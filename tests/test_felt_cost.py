@@ -1,0 +1,73 @@
+"""Costs that are seldom felt: `cost_seen` and `cost_false`."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs.vector import felt_cost
+from pmt_jax import load_config, make_setup
+from pmt_jax.errors import UsageError
+from pmt_jax.learning import learner
+
+B, N, K = 40_000, 2, 1
+
+
+def test_a_cost_that_is_always_felt_is_itself_bit_for_bit():
+    cost = jax.random.uniform(jax.random.key(0), (B, N, K)) * (jnp.arange(B) % 3 == 0)[:, None, None]
+    np.testing.assert_array_equal(felt_cost(cost, jax.random.key(1), 1.0, 0.0), cost)
+
+
+def test_shares_of_felt_harm_and_of_false_alarms():
+    costly = jnp.arange(B) % 2 == 0
+    cost = jnp.broadcast_to(costly[:, None, None] * 1.0, (B, N, K))
+    felt = np.asarray(felt_cost(cost, jax.random.key(2), 0.2, 0.05))
+    assert (felt[:, 0] == felt[:, 1]).all()  # one draw for the team
+    spread = 4 * (0.25 / (B / 2)) ** 0.5
+    assert felt[np.asarray(costly)].mean() == pytest.approx(0.2, abs=spread)
+    assert felt[~np.asarray(costly)].mean() == pytest.approx(0.05, abs=spread)
+
+
+def test_one_agents_cost_alone_makes_a_step_costly():
+    cost = jnp.zeros((B, N, K)).at[:, 1].set(1.0)
+    felt = np.asarray(felt_cost(cost, jax.random.key(3), 0.5, 0.9))
+    assert (felt[:, 0] == 0).all()  # the safe agent of a costly step gets no false alarm
+    assert 0.4 < felt[:, 1].mean() < 0.6
+
+
+def test_the_tasks_limit_follows_what_is_felt():
+    small = {"num_envs": 4, "rollout_length": 16, "minibatches": 1}
+    assert make_setup(load_config("lane", cost_seen=0.1, **small)).cost_limit == pytest.approx(0.1)
+    assert make_setup(load_config("lane", cost_false=0.5, **small)).cost_limit == pytest.approx(1 + 0.5 * 24)
+    assert make_setup(load_config("lane", cost_seen=0.1, cost_limit=0.7, **small)).cost_limit == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("change", [{"cost_seen": 0}, {"cost_seen": 1.5}, {"cost_false": 1}, {"cost_false": -0.1}])
+def test_shares_that_are_none(change: dict[str, float]):
+    with pytest.raises(UsageError, match=next(iter(change))):
+        load_config("lane", **change)
+
+
+def test_the_learner_sees_what_is_felt_and_reports_what_was_true_for_swept_shares():
+    config = load_config("switch", "f4sg", num_envs=64, rollout_length=25, minibatches=1, epochs=1, hidden=(8,))
+    setup = make_setup(config)
+    seen = jnp.asarray([1.0, 0.5, 0.25])
+    hypers = [setup.hyper.__class__(**{**vars(setup.hyper), "cost_seen": p}) for p in seen]
+    hyper = jax.tree.map(lambda *x: jnp.stack(x), *hypers)
+    keys = jax.vmap(jax.random.key)(jnp.zeros(3, jnp.int32))
+
+    @jax.jit
+    @jax.vmap
+    def first_update(hyper, key):
+        return learner.train_step(setup, hyper, learner.init(setup, hyper, key))[1]
+
+    metrics = jax.device_get(first_update(hyper, keys))
+    # The same seed acts alike before it has learned: what is true agrees, what is felt is its share.
+    np.testing.assert_array_equal(metrics["true_step_cost"], metrics["true_step_cost"][0])
+    assert metrics["step_cost"][0] == metrics["true_step_cost"][0] > 0.05
+    assert metrics["episode_cost"][0] == metrics["true_episode_cost"][0]
+    assert metrics["violation_rate"][0] == metrics["true_violation_rate"][0]
+    share = metrics["step_cost"] / metrics["true_step_cost"]
+    np.testing.assert_allclose(share, seen, atol=4 * 0.5 / (1600 * metrics["true_step_cost"][0]) ** 0.5)
