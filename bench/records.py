@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from envs.physics.engines import usable_cpus
+from envs.physics import usable_cpus
 from pmt_jax.files import replace_text
 from pmt_jax.training.run_folder import version
 

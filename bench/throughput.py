@@ -41,7 +41,7 @@ import psutil
 import envs
 from envs.ant import corridor
 from envs.hands import hand_over
-from envs.physics.engines import usable_cpus
+from envs.physics import usable_cpus
 from pmt_jax import load_config
 from pmt_jax.learning import learner
 from pmt_jax.learning.setup import make_setup

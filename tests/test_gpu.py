@@ -18,8 +18,9 @@ import pytest
 import scipy.stats
 
 import envs
+from envs import physics
 from envs.ant import corridor
-from envs.physics import engines
+from envs.physics import warp_engine
 from places import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
@@ -101,7 +102,7 @@ def test_random_policy_earns_the_same_on_warp_and_c(task):
     assert p > 0.05
 
 
-def ants(count: int) -> tuple[engines.PhysicsState, jax.Array]:
+def ants(count: int) -> tuple[physics.PhysicsState, jax.Array]:
     """Ants on the ground and in the air."""
     env = envs.make("ant_2x4", physics="warp")
     start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), count)).carry.physics
@@ -110,7 +111,7 @@ def ants(count: int) -> tuple[engines.PhysicsState, jax.Array]:
 
 def test_nested_vmap_is_one_batch():
     state, ctrl = ants(32)
-    step = engines.make_engine(corridor.model(), substeps=5, readout={}, physics="warp").step
+    step = physics.make_engine(corridor.model(), substeps=5, readout={}, physics="warp").step
     flat, _ = jax.jit(jax.vmap(step))(state, ctrl)
     nested, _ = jax.jit(jax.vmap(jax.vmap(step)))(*jax.tree.map(lambda x: x.reshape(4, 8, -1), (state, ctrl)))
     np.testing.assert_allclose(nested.qpos.reshape(32, -1), flat.qpos, atol=1e-4)
@@ -120,14 +121,14 @@ def test_nested_vmap_is_one_batch():
 def test_lost_contacts_show(contacts, lost):
     """Ants on all fours touch the floor in more than one place."""
     state, ctrl = ants(64)
-    on_the_ground = engines.PhysicsState(state.qpos.at[:, 2].set(0.35), state.qvel, state.warmstart)
-    engine = engines.make_engine(corridor.model(), substeps=5, readout={}, physics="warp", contacts=contacts)
+    on_the_ground = physics.PhysicsState(state.qpos.at[:, 2].set(0.35), state.qvel, state.warmstart)
+    engine = physics.make_engine(corridor.model(), substeps=5, readout={}, physics="warp", contacts=contacts)
     _, out = jax.jit(jax.vmap(engine.step))(on_the_ground, ctrl)
     assert bool(out["overflow"].any()) == lost
 
 
 def test_training_stops_where_contacts_were_lost(cli, tmp_path, monkeypatch):
-    monkeypatch.setattr(engines, "_MOST_CONTACTS", 1)
+    monkeypatch.setattr(warp_engine, "_MOST_CONTACTS", 1)
     settings = ["--num-envs", 64, "--rollout-length", 64, "--steps", 4096 * 4, "--no-cache"]
     code, out, _ = cli("train", "ant_2x4", "--out", tmp_path / "x", *settings)
     assert code == 1 and "no room for all contacts" in out
@@ -157,7 +158,7 @@ def test_learner_computes_the_same_as_on_a_cpu(method):
 def test_controls_may_come_straight_from_a_scans_inputs():
     """XLA would hand such a slice to Warp without a copy, which ended in an illegal address."""
     state, ctrl = ants(64)
-    step = jax.vmap(engines.make_engine(corridor.model(), substeps=5, readout={}, physics="warp").step)
+    step = jax.vmap(physics.make_engine(corridor.model(), substeps=5, readout={}, physics="warp").step)
     controls = jnp.stack([ctrl, -ctrl, ctrl])
     after, _ = jax.jit(lambda state, controls: jax.lax.scan(lambda s, c: (step(s, c)[0], None), state, controls))(
         state, controls

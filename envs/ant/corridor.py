@@ -30,8 +30,7 @@ import numpy as np
 
 from ..base import EnvSpec, State
 from ..errors import one_of
-from ..physics import engines as _physics
-from ..physics.engines import PhysicsState
+from ..physics import PhysicsState, make_engine
 
 MODEL = Path(__file__).parent / "ant_corridor.xml"
 SUBSTEPS = 5  # integration steps of 0.01 s in a control step
@@ -83,7 +82,7 @@ class AntCorridor:
     Args:
       num_agents: 2 (four motors each: the two legs in front, the two behind) or 4 (one leg each: legs 4, 1, 2, 3). The
         order is the one that the reference code effectively uses, not the one its partition table declares.
-      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics.engines`.
+      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
       observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
         learners that keep running moments).
@@ -101,7 +100,7 @@ class AntCorridor:
     ):
         self._standardise = one_of("observation", observation, ("zscore", "raw")) == "zscore"
         torso = model().body("torso").id
-        self._engine = _physics.make_engine(
+        self._engine = make_engine(
             model(),
             substeps=SUBSTEPS,
             readout={

@@ -39,8 +39,7 @@ import numpy as np
 
 from ..base import EnvSpec, State
 from ..errors import one_of
-from ..physics import engines as _physics
-from ..physics.engines import PhysicsState
+from ..physics import PhysicsState, make_engine, resolve
 
 MODEL = Path(__file__).parent / "hand_over.xml"
 SUBSTEPS = 2  # integration steps of 1/120 s in a control step
@@ -149,7 +148,7 @@ class HandOver:
       egg: its shape in contacts, `ellipsoid` or `capsule` (it looks and weighs the same); `auto` takes the ellipsoid
         but on `mjx`, where it takes twice the time and is 0.3 mm a step away from the other engines.
       full_hand: adds the 20 contacts inside each hand (fingers, thumb, palm) and the dry friction of its joints.
-      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics.engines`.
+      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
       threads: of the `mujoco` engine; all usable CPUs where None.
     """
@@ -166,12 +165,12 @@ class HandOver:
         threads: int | None = None,
     ):
         num_agents, self._costly, self._free = VARIANTS[one_of("variant", variant, VARIANTS)]
-        physics = _physics.resolve(physics)
+        physics = resolve(physics)
         one_of("egg", egg, ("auto", "ellipsoid", "capsule"))
         capsule = egg == "capsule" or (egg == "auto" and physics == "mjx")
         self.model = model(one_of("object", object, OBJECTS), capsule, full_hand)
         hinges = slice(0, HINGES)
-        self._engine = _physics.make_engine(
+        self._engine = make_engine(
             self.model,
             substeps=SUBSTEPS,
             readout={

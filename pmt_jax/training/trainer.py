@@ -262,7 +262,7 @@ def _rows(setup: Setup, step: int, metrics: dict[str, np.ndarray]) -> list[dict[
 
 
 NO_ROOM = "the warp engine had no room for all contacts or constraints"
-OVERFLOW = "info/physics_overflow"  # of the ant and the hands, see `envs.physics.engines.Engine`
+OVERFLOW = "info/physics_overflow"  # of the ant and the hands, see `envs.physics.Engine`
 COUNTS = ("episodes", "terminations", "non_finite")
 
 

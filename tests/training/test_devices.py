@@ -53,8 +53,8 @@ def train(count, task, **sizes):
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
-    from envs.physics import engines
-    engines.obstacle = lambda name: None
+    from envs.physics import contract
+    contract.obstacle = lambda name: None
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
 apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))

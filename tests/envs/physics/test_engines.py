@@ -14,16 +14,17 @@ import mujoco
 import numpy as np
 import pytest
 
+from envs import physics
 from envs.ant import corridor
 from envs.errors import TaskError
-from envs.physics import engines
+from envs.physics import c_engine, contract, mjx_patches, warp_engine
 from places import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 
 
 def engine(**options):
-    return engines.make_engine(corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
+    return physics.make_engine(corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
 
 
 def starts(count: int, seed: int = 0):
@@ -34,7 +35,7 @@ def starts(count: int, seed: int = 0):
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     qvel, ctrl = rng.normal(size=(count, 14)), rng.uniform(-1.2, 1.2, (count, 8))
     f32 = jnp.float32
-    state = engines.PhysicsState(jnp.asarray(qpos, f32), jnp.asarray(qvel, f32), jnp.zeros((count, 14), f32))
+    state = physics.PhysicsState(jnp.asarray(qpos, f32), jnp.asarray(qvel, f32), jnp.zeros((count, 14), f32))
     return state, jnp.asarray(ctrl, f32)
 
 
@@ -91,7 +92,7 @@ def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(tmp_path, monk
     state, ctrl = starts(8)
     step = jax.jit(jax.vmap(engine(threads=1).step))
     healthy = step(state, ctrl)
-    broken = engines.PhysicsState(
+    broken = physics.PhysicsState(
         state.qpos.at[2, 4].set(jnp.nan), state.qvel.at[4].set(1e9).at[5, 0].set(3e38), state.warmstart
     )
     after, out = step(broken, ctrl.at[6, 0].set(jnp.inf))
@@ -133,7 +134,7 @@ def test_two_programs_at_once_share_the_threads():
 
 
 def test_team_does_each_piece_once_and_leaves_nobody_behind():
-    team = engines._Team()
+    team = c_engine._Team()
     for threads in (1, 2, 5):
         queue, taken, at_work = iter(range(50)), [], []
 
@@ -150,7 +151,7 @@ def test_team_does_each_piece_once_and_leaves_nobody_behind():
 
 @pytest.mark.parametrize("guilty", ["the caller", "a helper"])
 def test_team_passes_errors_on_and_stops(guilty):
-    team, queue, caller, taken = engines._Team(), iter(range(1000)), threading.get_ident(), []
+    team, queue, caller, taken = c_engine._Team(), iter(range(1000)), threading.get_ident(), []
 
     def work():
         for piece in queue:
@@ -259,27 +260,27 @@ def test_interrupt_inside_a_step_never_passes_for_a_result():
 
 
 def test_hooks_are_where_we_expect_them():
-    engines.check_hooks()
+    mjx_patches.check_hooks()
 
 
 def test_hooks_are_put_back_after_tracing():
-    engines.import_mjx()
+    mjx_patches.import_mjx()
     from mujoco.mjx._src import collision_driver, solver
 
     before = dict(collision_driver._COLLISION_FUNC), solver._while_loop_scan
-    with pytest.raises(ZeroDivisionError), engines._hooked():
+    with pytest.raises(ZeroDivisionError), mjx_patches.patched():
         assert solver._while_loop_scan is not before[1]
         raise ZeroDivisionError
     assert (collision_driver._COLLISION_FUNC, solver._while_loop_scan) == before
 
 
 def test_missing_hooks_are_a_clear_error(monkeypatch):
-    engines.import_mjx()
+    mjx_patches.import_mjx()
     from mujoco.mjx._src import solver
 
     monkeypatch.delattr(solver, "_while_loop_scan")
     with pytest.raises(TaskError, match="lacks the private hooks"):
-        engines.check_hooks()
+        mjx_patches.check_hooks()
 
 
 @pytest.mark.parametrize(
@@ -291,23 +292,23 @@ def test_missing_hooks_are_a_clear_error(monkeypatch):
     ],
 )
 def test_wrong_versions_are_refused(monkeypatch, found, said):
-    monkeypatch.setattr(engines, "_version", found.get)
+    monkeypatch.setattr(contract, "installed_version", found.get)
     with pytest.raises(TaskError, match=said):
-        engines.check_versions()
+        physics.check_versions()
 
 
 def test_jax_that_deadlocks_is_refused(monkeypatch):
     monkeypatch.setattr(jax, "__version__", "0.10.1")
     with pytest.raises(TaskError, match="deadlocks"):
-        engines.check_versions()
+        physics.check_versions()
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="says what a CPU lacks")
 def test_warp_without_a_gpu_is_one_sentence():
     with pytest.raises(TaskError, match="physics 'warp' needs an NVIDIA GPU; found cpu"):
         engine(physics="warp")
-    assert engines.explain()["mujoco"] is None and engines.explain()["warp"] is not None
-    assert engines.resolve("auto") == "mujoco"
+    assert physics.explain()["mujoco"] is None and physics.explain()["warp"] is not None
+    assert physics.resolve("auto") == "mujoco"
 
 
 def test_warp_without_its_package_is_one_sentence(monkeypatch):
@@ -315,20 +316,20 @@ def test_warp_without_its_package_is_one_sentence(monkeypatch):
         platform, device_kind = "gpu", "NVIDIA H200"
 
     monkeypatch.setattr(jax, "devices", lambda: [Gpu])
-    monkeypatch.setattr(engines, "_version", lambda _: None)
+    monkeypatch.setattr(contract, "installed_version", lambda _: None)
     with pytest.raises(TaskError, match=r"needs warp-lang; found none; install it with pip install 'pmt-jax\[warp\]'"):
-        engines.resolve("warp")
-    assert engines.resolve("auto") == "mjx"
+        physics.resolve("warp")
+    assert physics.resolve("auto") == "mjx"
     with pytest.raises(TaskError, match="runs on CPUs only"):
-        engines.resolve("mujoco")
+        physics.resolve("mujoco")
 
 
 def test_room_for_contacts_in_warp():
-    assert engines._room(corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
+    assert warp_engine._room(corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
 
 
 def test_flattened_turns_any_vmap_into_one_batch():
-    doubled = engines._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+    doubled = warp_engine._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
 
     def lone(x, y):
         return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))

@@ -1,0 +1,144 @@
+"""The contract of all engines: their state, their protocol, which of them can run here, and the versions they need."""
+
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from ..errors import TaskError, one_of
+
+if TYPE_CHECKING:
+    import mujoco  # at runtime after `check_versions`: a missing MuJoCo then gets its sentence
+
+ENGINES = ("mjx", "mujoco", "warp")
+MUJOCO_SERIES = "3.17"  # RK4, contact margins and MJX's private hooks differ between minor versions
+INSTALL = f"pip install 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
+
+
+def check_versions() -> None:
+    """Refuses versions that are known to compute something else or to hang.
+
+    Raises:
+      TaskError: mujoco and mujoco-mjx are not the same 3.17.*, or jax is 0.10.*.
+    """
+    found = {name: installed_version(name) for name in ("mujoco", "mujoco-mjx")}
+    right = all(v is not None and v.startswith(MUJOCO_SERIES + ".") for v in found.values())
+    if not right or len(set(found.values())) != 1:
+        listing = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
+        raise TaskError(
+            f"the physics needs mujoco and mujoco-mjx of the same {MUJOCO_SERIES}.*; found {listing}; {INSTALL}"
+        )
+    if jax.__version__.startswith("0.10."):
+        raise TaskError(f"jax {jax.__version__} deadlocks on CPUs; pip install 'jax>=0.9.2,!=0.10.*'")
+
+
+def installed_version(package: str) -> str | None:
+    """A package's version; None where it is missing."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+check_versions()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PhysicsState:
+    """All that one control step needs to know of the last one.
+
+    Attributes:
+      qpos: [nq] positions in MuJoCo's order and units.
+      qvel: [nv] velocities.
+      warmstart: [nv] the acceleration the constraint solver starts from.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+
+
+Readout = Mapping[str, tuple[str, Any]]  # name -> (field of mjData, index into its first axis)
+
+
+class Engine(Protocol):
+    """A model and the means to advance it."""
+
+    name: str
+
+    def start(self) -> PhysicsState:
+        """The model's reference position at rest."""
+        ...
+
+    def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
+        """One control step of `substeps` integration steps under the constant `ctrl` [nu].
+
+        Returns:
+          The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
+          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. Beside them stands
+          `overflow`, 1 where the step found no room for all contacts or constraints and is wrong, else 0: only warp
+          has buffers that can be too small without raising.
+        """
+        ...
+
+
+def resolve(physics: str) -> str:
+    """The engine that `physics` means on this machine.
+
+    Raises:
+      TaskError: no such engine, or it cannot run here.
+    """
+    one_of("physics", physics, ("auto", *ENGINES))
+    if physics == "auto":
+        return next(name for name in _PREFERENCE if obstacle(name) is None)
+    reason = obstacle(physics)
+    if reason is not None:
+        raise TaskError(f"physics '{physics}' {reason}")
+    return physics
+
+
+_PREFERENCE = ("mujoco", "warp", "mjx")  # the first that can run: the first two never can on the same device
+
+
+def obstacle(physics: str) -> str | None:
+    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None where it can."""
+    device = jax.devices()[0]
+    if physics == "mujoco" and device.platform != "cpu":
+        return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
+    if physics == "warp":
+        if device.platform != "gpu" or "nvidia" not in device.device_kind.lower():
+            return f"needs an NVIDIA GPU; found {device.device_kind} (take 'mujoco' on CPUs, 'mjx' elsewhere)"
+        if installed_version("warp-lang") is None:
+            return "needs warp-lang; found none; install it with pip install 'pmt-jax[warp]'"
+    return None
+
+
+def explain() -> dict[str, str | None]:
+    """For each engine the obstacle to running it here, None where there is none."""
+    return {name: obstacle(name) for name in ENGINES}
+
+
+def usable_cpus() -> int:
+    """CPUs this process may run on, which in a container are fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def needs_post_constraint(readout: Readout) -> bool:
+    """Whether a readout holds forces that only `mj_rnePostConstraint` computes."""
+    return any(field in ("cfrc_ext", "cfrc_int", "cacc") for field, _ in readout.values())
+
+
+def rest_state(model: mujoco.MjModel) -> PhysicsState:
+    """The model's reference position at rest."""
+    dtype = jnp.result_type(float)
+    zeros = jnp.zeros(model.nv, dtype)
+    return PhysicsState(jnp.asarray(model.qpos0, dtype), zeros, zeros)
