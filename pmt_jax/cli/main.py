@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import pathlib
 import re
@@ -13,7 +14,7 @@ from typing import Any, NoReturn
 import pmt_jax
 
 from .. import tasks
-from ..config import settings as settings
+from ..config import settings, toml
 from ..config.methods import METHODS
 from ..errors import UsageError
 
@@ -140,10 +141,11 @@ def _add_devices(parser: argparse.ArgumentParser) -> None:
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     """A flag for every field of Config."""
-    parser.add_argument("--preset", default="default", help=f"{' | '.join(settings.PRESETS)}")
+    parser.add_argument("--preset", default="default", help=" | ".join(toml.presets()))
     group = parser.add_argument_group("settings", "each may also stand in the TOML file")
     defaults = settings.Config()
-    for name, text in settings.descriptions().items():
+    for field in dataclasses.fields(settings.Config):
+        name, text = field.name, field.metadata["help"]
         if name == "task":  # it is the positional argument
             continue
         kind = settings.FIELDS[name]

@@ -120,10 +120,10 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     return 0
 
 
-def _plan(task: str, methods: Sequence[str], budget: dict[str, Any]) -> Points:
-    """A budget's settings for all tasks, then those of this one."""
-    shared = {name: value for name, value in budget.items() if name != "tasks"}
-    return grid(task, {"method": methods}, **{**shared, **budget.get("tasks", {}).get(task, {})})
+def _plan(task: str, methods: Sequence[str], budget: Mapping[str, str]) -> Points:
+    """A budget's settings of a task: its `source` in configs/ for that task, or its `preset` over the task's own."""
+    source = budget.get("source", "{task}").format(task=task)
+    return grid(source, {"method": methods}, budget.get("preset", "default"))
 
 
 def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:

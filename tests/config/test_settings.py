@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 import envs
 from pmt_jax import METHODS, load_config
-from pmt_jax.config.settings import CONFIG_DIR, FIELDS, Config, descriptions, to_toml
+from pmt_jax.config import toml
+from pmt_jax.config.fields import GROUPS
+from pmt_jax.config.settings import Config, to_toml
 from pmt_jax.errors import UsageError
 
 
@@ -25,7 +27,9 @@ def test_every_task_has_a_configuration_for_every_method(task: str, method: str)
 
 
 def test_every_field_is_described():
-    assert set(descriptions()) == set(FIELDS)
+    fields = dataclasses.fields(Config)
+    assert all(field.metadata["help"] for field in fields)
+    assert {field.metadata["group"] for field in fields} == set(GROUPS)
 
 
 def test_precedence_is_defaults_file_method_table_overrides(tmp_path: pathlib.Path):
@@ -115,7 +119,10 @@ def test_settings_cannot_be_changed_in_place():
 
 
 def test_configuration_files_hold_no_code_and_no_other_task():
-    assert {p.stem for p in CONFIG_DIR.glob("*.toml")} == set(envs.names())
+    names = {name for name in toml.names() if not name.startswith("paper/")}
+    assert names == set(envs.names())
+    assert {name.removeprefix("paper/") for name in set(toml.names()) - names} <= names
+    assert all(p.suffix == ".toml" for p in toml.CONFIG_DIR.rglob("*") if p.is_file())
 
 
 def test_reading_settings_imports_neither_jax_nor_mujoco():

@@ -9,6 +9,7 @@ import signal
 
 import numpy as np
 import pytest
+import tomli_w
 
 from pmt_jax import load_config
 from pmt_jax.config.settings import to_toml
@@ -300,7 +301,9 @@ def test_reproduce_runs_what_is_missing_and_prints_it(alone: pathlib.Path, tmp_p
     tiny = {"seeds": 2, "num_envs": 4, "rollout_length": 25, "minibatches": 1, "hidden": [8], "epochs": 1}
     tiny |= {"log_interval": 2, "critic_lr": 0.001}  # the run alone, whose program is in the compile cache
     plan = {"title": "Table 0", "tasks": ["lane"], "methods": ["happo"], "baseline": "happo"}
-    paper = {"tables": {"table0": plan}, "budgets": {"smoke": {**tiny, "tasks": {"lane": {"steps": 600}}}}, "tasks": {}}
+    sizes = tmp_path / "sizes.toml"
+    sizes.write_text(tomli_w.dumps({"extends": "lane", "steps": 600, **tiny}))
+    paper = {"tables": {"table0": plan}, "budgets": {"smoke": {"source": str(sizes)}}, "tasks": {}}
     monkeypatch.setattr(table, "paper", lambda: paper)
     command = ("reproduce", "table0", "--out", tmp_path, "--no-cache")
     code, out, _ = cli(*command)
