@@ -55,7 +55,9 @@ def _setting(group: str, default: Any, text: str, bound: Bound | None = None) ->
     return dataclasses.field(default=default, metadata={"group": group, "help": text, "bound": bound})
 
 
-common, sizes, learning, constraint, emotion, simulation, output = (functools.partial(_setting, group) for group in GROUPS)
+common, sizes, learning, constraint, emotion, simulation, output = (
+    functools.partial(_setting, group) for group in GROUPS
+)
 
 
 def to_type(kind: Any, value: Any) -> Any:

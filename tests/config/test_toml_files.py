@@ -7,8 +7,8 @@ import pathlib
 import tomllib
 
 import pytest
-from places import ROOT
 
+from places import ROOT
 from pmt_jax import load_config
 from pmt_jax.config import toml
 from pmt_jax.errors import UsageError
