@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from . import user
+from . import ant, user, voltage
+from .columns import Column
 from .errors import TaskError, did_you_mean
 
 if TYPE_CHECKING:
@@ -18,19 +19,28 @@ if TYPE_CHECKING:
 
 __pmt__ = "pmt-jax"  # tells our `envs` from the unrelated package of that name on PyPI
 
-# name -> (module, class, the options that make this task of it)
-_TASKS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "ant_2x4": ("ant.corridor", "AntCorridor", {"num_agents": 2}),
-    "ant_4x2": ("ant.corridor", "AntCorridor", {"num_agents": 4}),
-    "hand_over_2x6": ("hands.hand_over", "HandOver", {"variant": "2x6"}),
-    "hand_over_4x3": ("hands.hand_over", "HandOver", {"variant": "4x3"}),
-    "hand_over_safe_joint": ("hands.hand_over", "HandOver", {"variant": "safe_joint"}),
-    "hand_over_safe_finger": ("hands.hand_over", "HandOver", {"variant": "safe_finger"}),
-    "lane": ("toys", "Lane", {}),
-    "switch": ("toys", "Switch", {}),
-    "noisy": ("toys", "Noisy", {}),
-    "voltage_33": ("voltage.control", "VoltageControl", {"case": "case33"}),
-    "voltage_141": ("voltage.control", "VoltageControl", {"case": "case141"}),
+
+class _Task(NamedTuple):
+    """A row of the registry: where the class is, the options that make this task of it, its columns in tables."""
+
+    module: str
+    cls: str
+    options: dict[str, Any] = {}
+    columns: Mapping[str, Column] = {}
+
+
+_TASKS = {
+    "ant_2x4": _Task("ant.corridor", "AntCorridor", {"num_agents": 2}, ant.COLUMNS),
+    "ant_4x2": _Task("ant.corridor", "AntCorridor", {"num_agents": 4}, ant.COLUMNS),
+    "hand_over_2x6": _Task("hands.hand_over", "HandOver", {"variant": "2x6"}),
+    "hand_over_4x3": _Task("hands.hand_over", "HandOver", {"variant": "4x3"}),
+    "hand_over_safe_joint": _Task("hands.hand_over", "HandOver", {"variant": "safe_joint"}),
+    "hand_over_safe_finger": _Task("hands.hand_over", "HandOver", {"variant": "safe_finger"}),
+    "lane": _Task("toys", "Lane"),
+    "switch": _Task("toys", "Switch"),
+    "noisy": _Task("toys", "Noisy"),
+    "voltage_33": _Task("voltage.control", "VoltageControl", {"case": "case33"}, voltage.COLUMNS),
+    "voltage_141": _Task("voltage.control", "VoltageControl", {"case": "case141"}, voltage.COLUMNS),
 }
 
 
@@ -58,8 +68,13 @@ def make(name: str, **options: Any) -> Env:
     for option in options:
         if option not in known:
             raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
-    cls, fixed = _task(name)
+    cls, fixed = _class(name)
     return user.build(cls, name, options) if user.is_file(name) else cls(**fixed, **options)
+
+
+def columns(name: str) -> Mapping[str, Column]:
+    """The figures of a task's `info` that tables show, by their name in `info`; none for tasks that are not ours."""
+    return _TASKS[name].columns if name in _TASKS else {}
 
 
 def task_options(name: str) -> list[str]:
@@ -68,14 +83,14 @@ def task_options(name: str) -> list[str]:
     Raises:
       TaskError: unknown name.
     """
-    cls, fixed = _task(name)
+    cls, fixed = _class(name)
     return [p for p in inspect.signature(cls).parameters if p not in fixed]
 
 
-def _task(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+def _class(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     if user.is_file(name):
         return user.factory(name), {}
     if name not in _TASKS:
         raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
-    module, class_name, fixed = _TASKS[name]
-    return getattr(importlib.import_module(f".{module}", __name__), class_name), fixed
+    task = _TASKS[name]
+    return getattr(importlib.import_module(f".{task.module}", __name__), task.cls), task.options

@@ -1,7 +1,7 @@
 """The environment contract: one State in, one State out.
 
-An environment is a value with a `spec` and four pure functions. It never resets itself and knows no horizon;
-batching, time limits, auto-reset and broken physics are `envs.vector`'s business alone.
+An environment is a value with a `spec`, the name of its `engine`, and two pure functions, `reset` and `step`. It never
+resets itself and knows no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
 
 Example:
   >>> import jax, envs
@@ -15,7 +15,8 @@ Example:
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Protocol
 
 import jax
 import numpy as np
@@ -72,9 +73,13 @@ class State:
     carry: Any
 
 
-@runtime_checkable
 class Env(Protocol):
-    """What `envs.make` returns. All methods are pure and can be jitted and vmapped."""
+    """What `envs.make` returns: these four are required. All methods are pure and can be jitted and vmapped.
+
+    A fifth is optional: `declares`, the `Declarations` of what only the task knows. The tasks of this package also have
+    `raw(state)`, the quantities of a state by name, and `restore(**raw)`, a State made of them: `restore(**raw(state))`
+    continues exactly as `state` would, so that recorded transitions can be replayed.
+    """
 
     spec: EnvSpec
     engine: str  # the physics engine behind it, 'xla' where the task is plain JAX
@@ -87,30 +92,80 @@ class Env(Protocol):
         """One control step with `action` [N, A]; actions are clipped by the task's own rule, not by the caller."""
         ...
 
-    def restore(self, **raw: Any) -> State:
-        """A State from the raw quantities that `raw` returns, so that recorded transitions can be replayed."""
-        ...
 
-    def raw(self, state: State) -> dict[str, jax.Array]:
-        """The raw quantities of a state: `restore(**raw(state))` continues exactly as `state` would."""
-        ...
+Policy = Callable[[State], jax.Array]  # a state of one environment -> action [N, A]
 
 
-@runtime_checkable
-class Drawn(Protocol):
-    """What an environment of MuJoCo bodies offers beyond `Env` to be seen; its `raw` must then hold `qpos`.
+Raw = Callable[[State], dict[str, Any]]  # the quantities of a state that a picture reads, by name
 
-    Bodies that follow no joint move by `mocap_pos` and `mocap_quat` in `raw`, where it holds them.
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plain:
+    """No picture of its own: the task's `info` is drawn over time."""
+
+    raw: Raw = lambda state: {}
+    kind: ClassVar[str] = "plain"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """MuJoCo bodies.
+
+    Attributes:
+      raw: its `qpos` poses the bodies; those that follow no joint move by `mocap_pos` and `mocap_quat`, where it has
+        them.
+      model: the mujoco.MjModel that is drawn; its first camera, if any, is the view.
+      decorate: `decorate(scene, raw, cost)` changes a mujoco.MjvScene of `model` before it is drawn, by colours or by
+        geoms appended to it. Its second argument is what `raw` returned for the moment, its third the cost of the step
+        that led there, mean over agents, summed over costs.
     """
 
-    model: Any  # the mujoco.MjModel that pictures are drawn from; its first camera, if any, is the view
+    raw: Raw
+    model: Any
+    decorate: Callable[[Any, dict[str, np.ndarray], float], None] = lambda scene, raw, cost: None
+    kind: ClassVar[str] = "scene"
 
-    def decorate(self, scene: Any, raw: dict[str, np.ndarray], cost: float) -> None:
-        """Changes a mujoco.MjvScene of `model` before it is drawn, by colours or by geoms appended to it.
 
-        Args:
-          scene: of the moment that `raw` describes.
-          raw: the raw quantities of that moment, without a batch axis.
-          cost: of the step that led there, mean over agents, summed over costs.
-        """
-        ...
+@dataclasses.dataclass(frozen=True, eq=False)
+class NetworkMap:
+    """A network of n nodes, coloured by a quantity that should stay within a band.
+
+    Attributes:
+      raw: its `quantity` [n] colours the nodes.
+      quantity: the name.
+      band: the quantity's lower and upper bound.
+      x, y: [n] places of the nodes, 0 to 1.
+      links: [b, 2] the nodes that each line joins.
+      agents: [N] the agents' nodes.
+    """
+
+    raw: Raw
+    quantity: str
+    band: tuple[float, float]
+    x: np.ndarray
+    y: np.ndarray
+    links: np.ndarray
+    agents: np.ndarray
+    kind: ClassVar[str] = "map"
+
+
+@dataclasses.dataclass(frozen=True)
+class Declarations:
+    """What only a task knows and generic code asks for; every field has a default.
+
+    The names of its columns in tables are declared in the registry of `envs`, which can be read without JAX.
+
+    Attributes:
+      picture: how an episode is drawn.
+      baselines: name -> a function that makes a policy which needs no training.
+      overflow: the name in `info` that is above 0 where the physics lost contacts, which makes a step wrong.
+    """
+
+    picture: Plain | Scene | NetworkMap = Plain()
+    baselines: Mapping[str, Callable[[], Policy]] = dataclasses.field(default_factory=dict)
+    overflow: str | None = None
+
+
+def declarations(env: Env) -> Declarations:
+    """What `env` declares; the defaults where it has no `declares`."""
+    return getattr(env, "declares", Declarations())

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import importlib
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
 
 if TYPE_CHECKING:
-    import jax
-
-    from envs.base import Env, EnvSpec, State
+    from envs.base import Env, EnvSpec, Policy, State, declarations
+    from envs.columns import Column
     from envs.vector import Outcome, VectorEnv, VectorState, felt_cost
 
 __all__ = [
@@ -24,6 +23,8 @@ __all__ = [
     "VectorState",
     "absolute",
     "baseline",
+    "columns",
+    "declarations",
     "did_you_mean",
     "engines",
     "felt_cost",
@@ -44,15 +45,15 @@ def _envs() -> types.ModuleType:
     return envs
 
 
-_TYPES = {"Env": "base", "EnvSpec": "base", "State": "base"}
-_TYPES |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
+_CONTRACT = {"Env": "base", "EnvSpec": "base", "State": "base", "declarations": "base"}
+_CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
 
 
 def __getattr__(name: str) -> Any:
-    """The contract's types, imported (with JAX) when first asked for."""
-    if name not in _TYPES:
+    """The contract's types and functions, imported (with JAX) when first asked for."""
+    if name not in _CONTRACT:
         raise AttributeError(f"module 'pmt_jax.tasks' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{_envs().__name__}.{_TYPES[name]}"), name)
+    return getattr(importlib.import_module(f"{_envs().__name__}.{_CONTRACT[name]}"), name)
 
 
 def names() -> list[str]:
@@ -75,20 +76,23 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     return _envs().errors.did_you_mean(word, choices)
 
 
-def baseline(env: Env, name: str) -> Callable[[State], jax.Array]:
-    """A policy that nobody has to learn: state -> action [N, A].
+def baseline(env: Env, name: str) -> Policy:
+    """A policy that needs no training: state -> action [N, A].
 
     Raises:
       UsageError: unknown policy, or a task that has none.
     """
-    package = _envs().__name__
-    grid = importlib.import_module(f"{package}.voltage.control")
-    if not isinstance(env, grid.VoltageControl):
-        raise UsageError(f"task '{env.spec.name}' has no baseline policies; the voltage tasks have")
-    known = importlib.import_module(f"{package}.voltage.baselines").POLICIES
+    known = importlib.import_module(f"{_envs().__name__}.base").declarations(env).baselines
+    if not known:
+        raise UsageError(f"task '{env.spec.name}' has no baseline policies")
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
-    return known[name](env)
+    return known[name]()
+
+
+def columns(name: str) -> Mapping[str, Column]:
+    """The figures of a task's `info` that tables show, by their name in `info`; needs no JAX."""
+    return _envs().columns(name)
 
 
 def engines() -> tuple[str, dict[str, str | None]]:

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import EnvSpec, State
+from ..base import Declarations, EnvSpec, Scene, State
 from ..errors import one_of
 from ..physics import PhysicsState, make_engine
 
@@ -114,6 +114,7 @@ class AntCorridor:
             threads=threads,
         )
         self.engine = self._engine.name
+        self.declares = Declarations(picture=Scene(self.raw, model(), self.decorate), overflow="physics_overflow")
         action_dim = model().nu // num_agents
         state_dim = model().nq - 2 + model().nv + 2
         self.spec = EnvSpec(

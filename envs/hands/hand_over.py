@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import EnvSpec, State
+from ..base import Declarations, EnvSpec, Scene, State
 from ..errors import one_of
 from ..physics import PhysicsState, make_engine, resolve
 
@@ -183,6 +183,7 @@ class HandOver:
             threads=threads,
         )
         self.engine = self._engine.name
+        self.declares = Declarations(picture=Scene(self.raw, self.model, self.decorate), overflow="physics_overflow")
         self._joint_range = self.model.jnt_range[:HINGES]  # [48, 2] rad
         self._motor_range = self.model.actuator_ctrlrange  # [40, 2] rad
         self._chains = _chains(self.model)

@@ -15,14 +15,15 @@ Example:
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 
-from ..base import State
-from .control import VoltageControl
+from ..base import Policy, State
 
-Policy = Callable[[State], jax.Array]
+if TYPE_CHECKING:
+    from .control import VoltageControl
 
 # IEEE 1547-2018, category B: 44 % of the rating over 6 % of voltage. The standard's default curve has a dead band of
 # 2 % around nominal voltage, the baseline that is quoted for this benchmark has none.

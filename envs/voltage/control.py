@@ -18,6 +18,7 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base import EnvSpec, State
+from ..base import Declarations, EnvSpec, NetworkMap, State
 from ..errors import TaskError, one_of
 from . import power_flow
+from .baselines import POLICIES
+from .layout import layout
 from .power_flow import Network, PowerFlow
 from .profiles import ROWS_PER_DAY, Profiles, load_profiles
 
@@ -207,7 +210,19 @@ class VoltageControl:
                 f"{self._limit // ROWS_PER_DAY + 2}"
             )
 
-    # The four functions of the contract
+    # The contract
+
+    @functools.cached_property
+    def declares(self) -> Declarations:
+        """A map of the network, and the policies of `baselines`."""
+        network = self.scenario.network
+        x, y = layout(network.branch_bus, network.slack, network.n_bus)
+        links = np.array([pair if x[pair[0]] <= x[pair[1]] else pair[::-1] for pair in np.asarray(network.branch_bus)])
+        band = self.v_lower, self.v_upper
+        return Declarations(
+            picture=NetworkMap(self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"])),
+            baselines={name: functools.partial(make, self) for name, make in POLICIES.items()},
+        )
 
     def reset(self, key: jax.Array) -> State:
         """A random date at a random interval, reactive powers uniform; another one if that has no solution."""

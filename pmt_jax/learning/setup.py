@@ -64,6 +64,12 @@ class Setup:
         limits = self.trials.hyper.cost_limit if self.trials else self.cost_limit
         return np.broadcast_to(np.asarray(limits), self.config.seeds)
 
+    @property
+    def overflow(self) -> str | None:
+        """The metric that is above 0 where the physics lost contacts; None where the task declares none."""
+        name = tasks.declarations(self.vector.env).overflow
+        return None if name is None else f"info/{name}"
+
     def scale(self, moments: RunningMoments, x: jax.Array) -> jax.Array:
         """Observations or states as the networks see them: scaled by running `moments` if the config says so."""
         return running_moments.normalise_obs(moments, x) if self.config.obs_norm == "running" else x

@@ -15,7 +15,7 @@ from ..learning.setup import Setup
 from ..learning.types import ActingState
 from ..training.compile import evaluate_seeds
 from ..training.run_folder import MATMUL_PRECISION, Say
-from ..training.trainer import NO_ROOM, OVERFLOW, seed_intervals
+from ..training.trainer import NO_ROOM, seed_intervals
 from .load import load_run
 
 
@@ -42,7 +42,7 @@ def evaluate_states(setup: Setup, state: ActingState, episodes: int, determinist
     """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts."""
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic))(state))
-    if np.any(results.get(OVERFLOW, 0) > 0):
+    if setup.overflow and np.any(results[setup.overflow] > 0):
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
     return [
         {"seed": setup.config.seed + i, "cost_limit": setup.cost_limit, "step": step, **figures}

@@ -26,7 +26,7 @@ class Episode:
     Attributes:
       env: the environment it was played in; method, seed: whose policy played.
       cost_limit: on the episode's summed cost.
-      raw: {name: [T + 1, ...]}, the raw quantities of `env.raw` that are numbers.
+      raw: {name: [T + 1, ...]}, what the task's picture reads of each moment.
       step: [T + 1] control steps since the reset.
       reward, cost: [T + 1] of the step that led to each moment; cost is the mean over agents, summed over costs.
       reward_sum, cost_sum: [T + 1] of the episode so far.
@@ -49,9 +49,9 @@ class Episode:
         return len(self.reward)
 
     @property
-    def kind(self) -> str:
-        """How it can be drawn: a `scene` of MuJoCo bodies, a `map` of voltages, or `plain` figures over time."""
-        return "scene" if hasattr(self.env, "model") else "map" if hasattr(self.env, "scenario") else "plain"
+    def picture(self) -> Any:
+        """How the task declares that it is drawn: a `Scene`, a `NetworkMap` or `Plain` of `envs.base`."""
+        return tasks.declarations(self.env).picture
 
     def at(self, t: int) -> dict[str, np.ndarray]:
         """The raw quantities of moment `t`."""
@@ -102,13 +102,12 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
       raw, reward, cost, info, terminated with a leading [horizon + 1]; see `Episode`.
     """
     env = setup.vector.env
-    mask = jnp.asarray(env.spec.action_mask)
+    mask, picture = jnp.asarray(env.spec.action_mask), tasks.declarations(env).picture
     start_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(EVALUATION_KEY), number))
 
     def moment(s: tasks.State) -> dict[str, Any]:
-        raw = {
-            k: x for k, x in env.raw(s).items() if x is not None and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        }
+        found = picture.raw(s)
+        raw = {k: x for k, x in found.items() if x is not None and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)}
         cost = s.cost.sum(-1).mean()
         return {"raw": raw, "reward": s.reward, "cost": cost, "info": s.info, "terminated": s.terminated}
 
@@ -125,7 +124,8 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
 
 def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
     """The moments up to the first termination, without those that are not finite (nothing can draw them)."""
-    floats = [x.reshape(len(x), -1) for x in moments["raw"].values() if np.issubdtype(x.dtype, np.floating)]
+    raw = [x for x in moments["raw"].values() if np.issubdtype(x.dtype, np.floating)]
+    floats = [x.reshape(len(x), -1) for x in (moments["reward"], *raw)]
     broken = np.asarray(~np.isfinite(np.concatenate(floats, axis=1)).all(axis=1))
     ends = np.flatnonzero(moments.pop("terminated") & ~broken) + 1
     length = min([len(broken), *ends[:1], *np.flatnonzero(broken)[:1]])

@@ -83,9 +83,9 @@ def render(
 
 def _frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """[height, width, 3] pictures of an episode's moments."""
-    if episode.kind == "scene":
+    if episode.picture.kind == "scene":
         return _bodies(episode, size, gl_platform())
-    if episode.kind == "map":
+    if episode.picture.kind == "map":
         return _maps(episode, size)
     raise UsageError(f"task '{episode.env.spec.name}' has no film; write a page instead: -o replay.html")
 
@@ -120,7 +120,7 @@ def _bodies(episode: Episode, size: tuple[int, int], platform: str) -> Iterator[
 
     from . import scenes
 
-    model = episode.env.model  # pyright: ignore[reportAttributeAccessIssue]  (see envs.base.Drawn)
+    model = episode.picture.model
     width, height = size
     window = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
     window.make_current()
@@ -151,24 +151,24 @@ def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    sketch, voltages = grid_map.sketch(episode.env), episode.raw["vm_pu"]
-    x, y, (low, high) = sketch.x, -sketch.y, sketch.band
+    grid = episode.picture
+    x, y, (low, high), values = grid.x, -grid.y, grid.band, episode.raw[grid.quantity]
     figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#{:02x}{:02x}{:02x}".format(*PAPER))
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.03, 0.22, 0.94, 0.72), frameon=False, xticks=[], yticks=[])
     area = 40 * min(1, 45 / len(x))  # points^2 of a bus
     rim = area**0.5 / 3
-    elbows = [[(x[a], y[a]), (x[a], y[b]), (x[b], y[b])] for a, b in sketch.links]
+    elbows = [[(x[a], y[a]), (x[a], y[b]), (x[b], y[b])] for a, b in grid.links]
     lines: Any = axes.add_collection(LineCollection(elbows, linewidths=area**0.5 / 2.5, zorder=1))
-    marks = np.isin(np.arange(len(x)), sketch.agents)
+    marks = np.isin(np.arange(len(x)), grid.agents)
     looks = ((~marks, area, "o"), (marks, 1.75 * area, "s"))
     buses: list[Any] = [axes.scatter(x[m], y[m], s=s, marker=k, zorder=2) for m, s, k in looks]
-    _colour_bar(figure, sketch.band)
-    for v in voltages:
-        lines.set_color(grid_map.voltage_colours(v[sketch.links].mean(1), sketch.band))
+    _colour_bar(figure, grid.band)
+    for v in values:
+        lines.set_color(grid_map.voltage_colours(v[grid.links].mean(1), grid.band))
         for dots, chosen in zip(buses, (~marks, marks), strict=True):
             out = (v[chosen] < low) | (v[chosen] > high)
-            dots.set_facecolor(grid_map.voltage_colours(v[chosen], sketch.band))
+            dots.set_facecolor(grid_map.voltage_colours(v[chosen], grid.band))
             dots.set_edgecolor(np.where(out[:, None], np.array(INK) / 255, np.array(PAPER) / 255))
             dots.set_linewidth(np.where(out, rim, 0.4 * rim))
         canvas.draw()

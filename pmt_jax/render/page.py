@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from . import grid_map
 from .episode import Episode
 
 RATE = 20.0  # control steps that a replay shows a second
@@ -40,7 +39,7 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
       rate: control steps a second.
       play: begin at once (never where the reader's system asks for little motion).
     """
-    kind = episode.kind
+    kind = episode.picture.kind
     data: dict[str, Any] = {
         "kind": kind,
         "title": f"{episode.env.spec.name}, {episode.method}, seed {episode.seed}",
@@ -69,15 +68,15 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
 
 
 def _map(episode: Episode) -> dict[str, Any]:
-    """The grid as a voltage map: places and links of its buses, the agents' buses, the band, voltages [T + 1, n]."""
-    sketch = grid_map.sketch(episode.env)
+    """The network as a map: places and links of its nodes, the agents' nodes, the band, the quantity [T + 1, n]."""
+    grid = episode.picture
     return {
-        "x": _numbers(sketch.x),
-        "y": _numbers(sketch.y),
-        "links": sketch.links.tolist(),
-        "agents": sketch.agents.tolist(),
-        "band": list(sketch.band),
-        "values": to_base64(episode.raw["vm_pu"]),
+        "x": _numbers(grid.x),
+        "y": _numbers(grid.y),
+        "links": grid.links.tolist(),
+        "agents": grid.agents.tolist(),
+        "band": list(grid.band),
+        "values": to_base64(episode.raw[grid.quantity]),
     }
 
 

@@ -23,8 +23,7 @@ _SHAPES = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")): kind for name, kind i
 
 def scenes(episode: Episode) -> Iterator[mujoco.MjvScene]:
     """The scene of each moment, decorated by the environment; the same object each time, so use it before the next."""
-    model: mujoco.MjModel = episode.env.model  # pyright: ignore[reportAttributeAccessIssue]  (see envs.base.Drawn)
-    decorate = getattr(episode.env, "decorate", None)
+    model: mujoco.MjModel = episode.picture.model
     data, option, view = mujoco.MjData(model), mujoco.MjvOption(), camera(model)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + DECORATIONS)
     for t in range(len(episode)):
@@ -34,8 +33,7 @@ def scenes(episode: Episode) -> Iterator[mujoco.MjvScene]:
                 getattr(data, name)[:] = raw[name]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mjv_updateScene(model, data, option, None, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
-        if decorate is not None:
-            decorate(scene, raw, float(episode.cost[t]))
+        episode.picture.decorate(scene, raw, float(episode.cost[t]))
         yield scene
 
 
@@ -118,7 +116,7 @@ def _centre(pose: np.ndarray) -> np.ndarray:
 
 
 def _field_of_view(episode: Episode) -> float:
-    model = episode.env.model  # pyright: ignore[reportAttributeAccessIssue]
+    model = episode.picture.model
     return float(model.cam_fovy[0] if model.ncam else model.vis.global_.fovy)
 
 

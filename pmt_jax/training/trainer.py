@@ -196,7 +196,7 @@ def _loop(
             state, metrics = programs.chunk(now.state)
             step = now.step + config.log_interval * config.batch_size
             rows = _rows(setup, step, jax.device_get(metrics))
-            broken = _overflown(rows) or (None if setup.trials else _broken(rows))
+            broken = _overflown(setup, rows) or (None if setup.trials else _broken(rows))
             rows = _with_evaluation(setup, programs, state, rows, skip=broken is not None)
             seconds = start.seconds + time.monotonic() - begin
             _write(sinks, [{**row, "seconds": round(seconds, 3)} for row in rows])
@@ -262,7 +262,6 @@ def _rows(setup: Setup, step: int, metrics: dict[str, np.ndarray]) -> list[dict[
 
 
 NO_ROOM = "the warp engine had no room for all contacts or constraints"
-OVERFLOW = "info/physics_overflow"  # of the ant and the hands, see `envs.physics.Engine`
 COUNTS = ("episodes", "terminations", "non_finite")
 
 
@@ -285,9 +284,9 @@ def _broken(rows: list[dict[str, Any]]) -> str | None:
     return None
 
 
-def _overflown(rows: list[dict[str, Any]]) -> str | None:
+def _overflown(setup: Setup, rows: list[dict[str, Any]]) -> str | None:
     """What is wrong, if the physics lost contacts."""
-    share = max(row.get(OVERFLOW, 0.0) for row in rows)
+    share = max(row[setup.overflow] for row in rows) if setup.overflow else 0.0
     if not share:
         return None
     return (
