@@ -1,11 +1,13 @@
 """Speed and memory, measured, compared with what was committed, and rendered into the documentation.
 
-python -m bench all                            everything, into bench/results; then the documentation's tables
-python -m bench all --quick                    does everything run? minutes, into a folder of its own
-python -m bench all --only throughput,grid
-python -m bench list
+python -m bench list                           what is measured, and how long it took
+python -m bench run                            everything, into bench/results; then the documentation's tables
+python -m bench run --quick                    does everything run? minutes, into a folder of its own
+python -m bench run ant grid                   some of it
 python -m bench compare HEAD~5 bench/results   results as files, folders or git revisions
 python -m bench render --check                 are the documentation's tables what bench/results says?
+python -m bench store RUN... -o FILE.json      training runs as a result for tables and pictures
+python -m bench publish RUN...                 the best policy of each run becomes the pretrained one of its task
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from typing import Any, NoReturn
 from pmt_jax.cli.main import answer, refuse_unknown
 from pmt_jax.errors import UsageError
 
-from . import compare, render, suite
+from . import compare, records, render, runner, runs
+from .cases import BENCHES
 
 say = functools.partial(print, flush=True)
 
@@ -47,12 +50,21 @@ def _run(argv: Sequence[str]) -> int:
 def _parser() -> tuple[_Parser, list[str]]:
     parser = _Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands: Any = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
-    every = commands.add_parser("all", help="run all benches, or some, one after the other")
-    every.add_argument("--quick", action="store_true", help="a smoke: few cases, few repeats")
-    every.add_argument("--only", metavar="NAMES", help="with commas; python -m bench list shows them")
-    every.add_argument("--out", type=pathlib.Path, help="a folder (default: bench/results; with --quick a new one)")
-    every.set_defaults(run=_all)
     commands.add_parser("list", help="the benches, and how long they took").set_defaults(run=_list)
+    every = commands.add_parser("run", help="run all benches, or some, one after the other")
+    every.add_argument("names", nargs="*", metavar="NAME", help="python -m bench list shows them")
+    every.add_argument("--out", type=pathlib.Path, help="a folder (default: bench/results; for parts a new one)")
+    every.set_defaults(run=_run_benches)
+    one = commands.add_parser("measure", help="run one bench in this process, as `run` does in another")
+    one.add_argument("name", choices=BENCHES)
+    one.add_argument("--out", type=pathlib.Path, required=True, help="a JSON file")
+    one.set_defaults(run=_measure)
+    for command in (every, one):
+        command.add_argument("--quick", action="store_true", help="a smoke: few cases, few repeats")
+        command.add_argument("--threads", type=int, default=0, help="use so many of the CPU's")
+        command.add_argument(
+            "--only", default="", metavar="WORDS", help="cases whose labels have all these, with commas"
+        )
     compared = commands.add_parser("compare", help="ratios between results")
     compared.add_argument("old", help="a JSON file, a folder of them, or a git revision")
     compared.add_argument("new", help="the same")
@@ -60,27 +72,40 @@ def _parser() -> tuple[_Parser, list[str]]:
     rendered = commands.add_parser("render", help="make the tables of README.md and docs/ from bench/results")
     rendered.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a table is old")
     rendered.set_defaults(run=_render)
+    stored = commands.add_parser("store", help="training runs as a result")
+    stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
+    published = commands.add_parser("publish", help="make pretrained policies of runs, and tell their figures")
+    published.add_argument("--episodes", type=int, default=64, help="of the evaluations (default 64)")
+    for command, run, count in ((stored, _store, "+"), (published, _publish, "*")):
+        command.add_argument("folders", nargs=count, type=pathlib.Path, metavar="RUN", help="run folders")
+        command.set_defaults(run=run)
     return parser, list(commands.choices)
 
 
-def _all(arguments: argparse.Namespace) -> int:
-    code = suite.run_all(arguments.only, arguments.out, arguments.quick, say)
-    if arguments.out is None and not arguments.quick:
-        render.documents_anew(check=False, say=say)
-    return code
-
-
 def _list(arguments: argparse.Namespace) -> int:
-    reports = compare.load(str(compare.RESULTS))
-    for name, bench in suite.BENCHES.items():
+    reports = records.load()
+    for name, bench in BENCHES.items():
         found = [r for result, r in reports.items() if result == name or result.startswith(f"{name}_")]
         took = ", ".join(f"{r['seconds']} s on {r['device']}" for r in found if "seconds" in r)
         say(f"{name}: {bench.what}{f' (took {took})' if took else ''}")
     return 0
 
 
+def _run_benches(arguments: argparse.Namespace) -> int:
+    asked = arguments.quick, arguments.threads, arguments.only
+    code = runner.run(arguments.names, arguments.out, *asked, say)
+    if arguments.out is None and not any(asked):
+        render.documents_anew(check=False, say=say)
+    return code
+
+
+def _measure(arguments: argparse.Namespace) -> int:
+    runner.measure(arguments.name, arguments.out, arguments.quick, arguments.threads, arguments.only, say)
+    return 0
+
+
 def _compare(arguments: argparse.Namespace) -> int:
-    old, new = compare.load(arguments.old), compare.load(arguments.new)
+    old, new = records.load(arguments.old), records.load(arguments.new)
     if pathlib.Path(arguments.old).is_file() and pathlib.Path(arguments.new).is_file():
         old = dict(zip(new, old.values(), strict=True))
     for name, report in new.items():
@@ -91,6 +116,18 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 def _render(arguments: argparse.Namespace) -> int:
     return render.documents_anew(arguments.check, say)
+
+
+def _store(arguments: argparse.Namespace) -> int:
+    say(f"{runs.store(arguments.folders, arguments.out)} run(s) in {arguments.out}")
+    return 0
+
+
+def _publish(arguments: argparse.Namespace) -> int:
+    from . import publish
+
+    publish.publish_all(arguments.folders, arguments.episodes, say)
+    return 0
 
 
 if __name__ == "__main__":

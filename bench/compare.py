@@ -1,28 +1,20 @@
-"""Results of benches against older ones: which figures became better or worse, and by how much.
+"""Results against older ones: which figures became better or worse, and by how much.
 
-A figure is told from its name's ending (bench/records.py): rates should be large, seconds and bytes small; a few shares
-should be large too, and mean more than rates where a machine was busy. Only results of the same kind of device are
-compared, on a CPU also of the same CPU and number of threads.
+A figure is told from its name's ending (bench/records.py): rates should be large, seconds and bytes small. Only results
+of the same kind of device are compared, on a CPU also of the same CPU and number of threads.
 """
 
 from __future__ import annotations
 
 import collections
-import json
-import pathlib
-import subprocess
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from pmt_jax.errors import UsageError
+from .records import Report, Row
 
-Report = dict[str, Any]
-
-RESULTS = pathlib.Path(__file__).parent / "results"
-LESS, SHARES = ("_seconds", "_gb", "_mb"), ("ratio", "of_plain_x_threads", "gpu_busy", "efficiency")
+LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
-SUBJECT = ("task", "case", "policy", "what", "method", "scaling", "changes", "physics", "solver", "precision")
-SIZES = ("devices", "seeds", "num_envs", "rollout_length", "batch", "steps")
+SUBJECT = ("kind", "task", "name", "what", "method", "physics", "solver")
+SIZES = ("threads", "devices", "seeds", "num_envs", "rollout_length")
 WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 
 
@@ -39,7 +31,7 @@ def more_is_better(name: str) -> bool:
     return name.endswith("_second") or name in SHARES
 
 
-def label(row: dict[str, Any]) -> str:
+def label(row: Row) -> str:
     """What a row is about, for people."""
     words = [str(row[name]) for name in SUBJECT if row.get(name)]
     return ", ".join([*words, *(f"{name} {row[name]:,}" for name in SIZES if name in row)])
@@ -57,21 +49,14 @@ def figures(report: Report) -> dict[tuple[str, str], float]:
     return found
 
 
-def kind(report: Report) -> tuple[Any, ...]:
-    """What must be the same for figures to be compared."""
-    machine = report.get("machine", {})
-    return (report["device"], machine.get("cpu"), machine.get("threads")) if on_cpu(report) else (report["device"],)
-
-
 def on_cpu(report: Report) -> bool:
     return report["device"] == "cpu"
 
 
 def changes(old: Report, new: Report) -> list[Change]:
     """Every figure that both have, worst first."""
-    before, after = figures(old), figures(new)
-    found = []
-    for (about, name), value in after.items():
+    before, found = figures(old), []
+    for (about, name), value in figures(new).items():
         if (then := before.get((about, name))) is not None:
             ratio = value / then if more_is_better(name) else then / value
             found.append(Change(f"{about}: {name}", then, value, ratio))
@@ -79,11 +64,11 @@ def changes(old: Report, new: Report) -> list[Change]:
 
 
 def describe(name: str, old: Report | None, new: Report) -> str:
-    """The comparison of one bench, for people."""
+    """The comparison of one result, for people."""
     if old is None:
         return f"{name}: nothing older to compare with"
-    if kind(old) != kind(new):
-        then, now = (", ".join(str(x or "unknown") for x in kind(report)) for report in (old, new))
+    if _kind(old) != _kind(new):
+        then, now = (", ".join(str(x or "unknown") for x in _kind(report)) for report in (old, new))
         return f"{name}: not compared, since the older figures are of {then}, these of {now}"
     found = changes(old, new)
     worse = sum(change.ratio < WORSE for change in found)
@@ -95,33 +80,7 @@ def describe(name: str, old: Report | None, new: Report) -> str:
     return "\n".join(lines)
 
 
-def load(source: str) -> dict[str, Report]:
-    """Results by name: of a JSON file, of a folder, or as committed in a git revision.
-
-    Raises:
-      UsageError: it is none of these.
-    """
-    path = pathlib.Path(source)
-    if path.is_dir():
-        return _reports((p.stem, p.read_text()) for p in sorted(path.glob("*.json")))
-    if path.is_file():
-        return _reports([(path.stem, path.read_text())])
-    if (listed := _git("ls-tree", "--name-only", source, "results/")) is None:
-        raise UsageError(f"'{source}' is neither a file of results, a folder of them nor a git revision")
-    names = [name for name in listed.splitlines() if name.endswith(".json")]
-    return _reports((pathlib.Path(name).stem, _git("show", f"{source}:./{name}") or "") for name in names)
-
-
-def _reports(texts: Iterable[tuple[str, str]]) -> dict[str, Report]:
-    """Those of `texts` that `records.write` wrote."""
-    parsed = ((name, json.loads(text)) for name, text in texts)
-    return {name: report for name, report in parsed if isinstance(report, dict) and {"rows", "device"} <= set(report)}
-
-
-def _git(*words: str) -> str | None:
-    """What git says in this folder; None where it fails or is missing."""
-    try:
-        done = subprocess.run(["git", *words], cwd=RESULTS.parent, capture_output=True, text=True, check=False)
-    except FileNotFoundError:
-        return None
-    return done.stdout if done.returncode == 0 else None
+def _kind(report: Report) -> tuple[Any, ...]:
+    """What must be the same for figures to be compared."""
+    machine = report.get("machine", {})
+    return (report["device"], machine.get("cpu"), machine.get("threads")) if on_cpu(report) else (report["device"],)

@@ -1,7 +1,7 @@
 """Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
 
-    python -m bench.publish runs/paper/ant_2x4/*    writes pmt_jax/hub/TASK-METHOD.npz, one for each run folder
-    python -m bench.publish                         only writes anew what is told about all of them
+    python -m bench publish runs/paper/ant_2x4/*    writes pmt_jax/policies/pretrained/TASK-METHOD.npz, one for each run
+    python -m bench publish                         only writes anew what is told about all of them
 
 What is told: bench/results/hub.json and the table in docs/pretrained.md. All figures are means over the same whole
 episodes under mean actions; a policy is better by the rule that `best` checkpoints are kept by (docs/runs.md), but
@@ -10,10 +10,10 @@ those of methods without a constraint by their reward alone.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import pathlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -118,23 +118,12 @@ def rows() -> records.Rows:
     return [{"name": name, "bytes": hub.file_of(name).stat().st_size, **hub.about(name)} for name in hub.names()]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", type=pathlib.Path, metavar="RUNFOLDER")
-    parser.add_argument("--episodes", type=int, default=64)
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("bench/results/hub.json"))
-    arguments = parser.parse_args()
+def publish_all(folders: Sequence[pathlib.Path], episodes: int, say: Callable[[str], None]) -> None:
+    """Publishes the best policy of each run folder, then tells of all pretrained policies anew."""
     use_cache()
-    for folder in arguments.folders:
-        try:
-            facts = publish(folder, arguments.episodes)
-        except UsageError as error:
-            parser.error(str(error))
+    for folder in folders:
+        facts = publish(folder, episodes)
         reward, cost = (facts["figures"][f"episode_{what}"][0] for what in ("reward", "cost"))
-        print(f"{folder}: seed {facts['seed']}, {facts['which']}, reward {reward:.2f}, cost {cost:.2f}", flush=True)
-    records.write(arguments.out, rows())
-    render.documents_anew(check=False)
-
-
-if __name__ == "__main__":
-    main()
+        say(f"{folder}: seed {facts['seed']}, {facts['which']}, reward {reward:.2f}, cost {cost:.2f}")
+    records.write(records.RESULTS / "hub.json", rows(), "python -m bench publish")
+    render.documents_anew(check=False, say=say)

@@ -1,4 +1,4 @@
-"""Rows of a bench on disk, with where, when and with what they were measured."""
+"""Results: rows on disk, with where, when, with what and by which command they were measured."""
 
 from __future__ import annotations
 
@@ -9,44 +9,45 @@ import pathlib
 import platform
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 
 from envs.physics import usable_cpus
+from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.training.run_folder import version
 
-Rows = list[dict[str, Any]]
+Row = dict[str, Any]
+Rows = list[Row]
+Report = dict[str, Any]  # conditions and rows
 
+RESULTS = pathlib.Path(__file__).parent / "results"
 PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "warp-lang", "numpy")
+PACKAGES += ("pandapower", "lightsim2grid", "power-grid-model", "orbax-checkpoint")
 _BEGIN = time.monotonic()
 
 
-def write(out: pathlib.Path, rows: Rows, packages: Sequence[str] = (), **more: Any) -> None:
-    """Writes `rows` below their `conditions` and whatever else belongs there; the old file stays until all is written.
+def write(out: pathlib.Path, rows: Rows, command: str) -> None:
+    """Writes `rows` below their `conditions`; the old file stays until all is written.
 
     A figure's name ends in its unit: `_second` for a rate (more is better); `_seconds`, `_gb` (1e9 bytes) and `_mb`
     for what should be small. By that `bench compare` knows which way is worse.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(out, json.dumps({**conditions(packages), **more, "rows": rows}, indent=1) + "\n")
+    replace_text(out, json.dumps({"command": command, **conditions(), "rows": rows}, indent=1) + "\n")
 
 
-def read(source: pathlib.Path) -> Rows:
-    """The rows that `write` wrote."""
-    return json.loads(source.read_text())["rows"]
-
-
-def conditions(packages: Sequence[str] = ()) -> dict[str, Any]:
-    """Machine, device, versions (of `packages` too), commit, date (UTC), load average, seconds this process took."""
+def conditions() -> dict[str, Any]:
+    """Machine, device, versions, commit, date (UTC), load average, seconds this process took."""
+    changed = "+changes" if git("status", "--porcelain", "-uno") else ""
     return {
         "machine": machine(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        "versions": {"python": platform.python_version(), **{p: version(p) for p in (*PACKAGES, *packages)}},
-        "commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain", "-uno") else ""),
+        "versions": {"python": platform.python_version(), **{p: v for p in PACKAGES if (v := version(p))}},
+        "commit": (git("rev-parse", "--short", "HEAD") or "unknown").strip() + changed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "load_average": [round(x, 2) for x in os.getloadavg()],
         "seconds": round(time.monotonic() - _BEGIN),
@@ -62,10 +63,33 @@ def machine() -> dict[str, Any]:
     return {"cpu": cpu, "threads": usable_cpus(), "memory_gb": round(memory), "system": platform.platform()}
 
 
-def _git(*words: str) -> str:
-    """What git says, empty where there is no git or no repository."""
-    here = pathlib.Path(__file__).parent
+def load(source: str | pathlib.Path = RESULTS) -> dict[str, Report]:
+    """Results by name: of a JSON file, of a folder, or as committed in a git revision.
+
+    Raises:
+      UsageError: it is none of these.
+    """
+    path = pathlib.Path(source)
+    if path.is_dir():
+        return _reports((p.stem, p.read_text()) for p in sorted(path.glob("*.json")))
+    if path.is_file():
+        return _reports([(path.stem, path.read_text())])
+    if (listed := git("ls-tree", "--name-only", str(source), "results/")) is None:
+        raise UsageError(f"'{source}' is neither a file of results, a folder of them nor a git revision")
+    names = [name for name in listed.splitlines() if name.endswith(".json")]
+    return _reports((pathlib.Path(name).stem, git("show", f"{source}:./{name}") or "") for name in names)
+
+
+def _reports(texts: Iterable[tuple[str, str]]) -> dict[str, Report]:
+    """Those of `texts` that `write` wrote."""
+    parsed = ((name, json.loads(text)) for name, text in texts)
+    return {name: report for name, report in parsed if isinstance(report, dict) and {"rows", "device"} <= set(report)}
+
+
+def git(*words: str) -> str | None:
+    """What git says in this folder; None where it fails or is missing."""
     try:
-        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=False).stdout.strip()
+        done = subprocess.run(["git", *words], cwd=RESULTS.parent, capture_output=True, text=True, check=False)
     except FileNotFoundError:
-        return ""
+        return None
+    return done.stdout if done.returncode == 0 else None

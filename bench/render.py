@@ -2,7 +2,7 @@
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
 bench/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` stands for the
-table, as `pmt table` makes it, of the runs in bench/results/FILE.json, which bench/curves.py wrote.
+table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run.
 """
 
 from __future__ import annotations
@@ -15,23 +15,22 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
-from . import curves
-from .compare import RESULTS, Report, load
-from .tables import TABLES
+from . import records, runs
+from .tables import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
-CURVES = "curves:"
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
+STORED = {"curves": runs.as_pmt_table, "points": runs.as_points}
 
 
 def documents() -> list[pathlib.Path]:
     """The Markdown files that have blocks."""
-    candidates = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    candidates = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
     return [path for path in candidates if MARK.search(path.read_text())]
 
 
-def render(text: str, reports: dict[str, Report]) -> str:
+def render(text: str, reports: Reports) -> str:
     """`text` with its blocks made anew.
 
     Raises:
@@ -40,8 +39,9 @@ def render(text: str, reports: dict[str, Report]) -> str:
 
     def block(found: re.Match[str]) -> str:
         begin, name, _, end = found.groups()
-        if name.startswith(CURVES):
-            return f"{begin}{curves.markdown(RESULTS / f'{name.removeprefix(CURVES)}.json')}\n{end}"
+        form, _, file = name.partition(":")
+        if form in STORED:
+            return f"{begin}{STORED[form](records.RESULTS / f'{file}.json')}\n{end}"
         if name not in TABLES:
             raise UsageError(f"unknown table '{name}'{did_you_mean(name, TABLES)}")
         return f"{begin}{TABLES[name](reports)}\n{end}"
@@ -54,7 +54,7 @@ def render(text: str, reports: dict[str, Report]) -> str:
 
 def documents_anew(check: bool, say: Callable[[str], None] = print) -> int:
     """Makes the tables anew or, to `check`, says which are not what the results say; 1 if there are any."""
-    reports, old = load(str(RESULTS)), 0
+    reports, old = records.load(), 0
     for path in documents():
         text = path.read_text()
         if (rendered := render(text, reports)) != text:

@@ -1,19 +1,27 @@
-"""`python -m bench`: what runs, how figures are compared, and that the documentation shows the committed results."""
+"""`python -m bench`: what runs, how figures are compared, and that pages show what is stored."""
 
 from __future__ import annotations
 
 import json
 import pathlib
+import sys
+import tomllib
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from bench import compare, curves, paths, records, render, suite, tables
+from bench import compare, measure, records, render, runner, runs, tables
 from bench.__main__ import main
+from bench.cases import BENCHES, Bench, Case
+from docs.figures import ant_paths, curves
+from pmt_jax.config.settings import FIELDS
+from pmt_jax.errors import UsageError
 from pmt_jax.studies import table
 
+ROOT = pathlib.Path(__file__).parents[2]
 FAKE = """
 import json, os, signal, sys
 what, out = sys.argv[1], sys.argv[-1]
@@ -25,18 +33,21 @@ sys.exit(3 if what == "failing" else 0)
 """
 
 
-def report(device: str = "cpu", cpu: str = "A", **figures: Any) -> compare.Report:
+def report(device: str = "cpu", cpu: str = "A", **figures: Any) -> records.Report:
     return {"device": device, "machine": {"cpu": cpu, "threads": 2}, "versions": {}, "rows": [{"task": "x", **figures}]}
 
 
 @pytest.fixture
-def fakes(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+def fakes(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., pathlib.Path]:
     """Replaces the benches by ones that write, fail or interrupt, as their names say; gives a folder for results."""
-    (tmp_path / "fake_bench.py").write_text(FAKE)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (tmp_path / "fake.py").write_text(FAKE)
+    monkeypatch.setattr(runner, "MEASURE", (sys.executable, str(tmp_path / "fake.py")))
 
-    def replace(*names: str) -> pathlib.Path:
-        monkeypatch.setattr(suite, "BENCHES", {n: suite.Bench(f"does {n}", f"fake_bench {n}", "") for n in names})
+    def replace(*names: str, **on: Any) -> pathlib.Path:
+        for name in list(BENCHES):
+            monkeypatch.delitem(BENCHES, name)
+        for name in names:
+            monkeypatch.setitem(BENCHES, name, Bench(f"does {name}", (), (), on.get(name, "cpu")))
         return tmp_path / "results"
 
     return replace
@@ -47,8 +58,8 @@ def test_one_that_fails_does_not_stop_the_others(
 ):
     out = fakes("first", "failing", "last")
     old = report() | {"machine": {}, "rows": [{"task": "lane", "steps_per_second": 200}]}
-    monkeypatch.setattr(suite, "_committed", lambda say: {"last": old})
-    assert main(["all", "--out", str(out)]) == 1
+    monkeypatch.setattr(runner, "_committed", lambda say: {"last": old})
+    assert main(["run", "--out", str(out)]) == 1
     assert sorted(path.name for path in out.iterdir()) == ["failing.json.unfinished", "first.json", "last.json"]
     said = capsys.readouterr().out
     assert "[3/3] last: does last" in said and "failed: failing" in said
@@ -57,7 +68,7 @@ def test_one_that_fails_does_not_stop_the_others(
 
 def test_ctrl_c_keeps_what_is_finished(fakes):
     out = fakes("first", "interrupted", "last")
-    assert main(["all", "--out", str(out)]) == 130
+    assert main(["run", "--out", str(out)]) == 130
     assert json.loads((out / "first.json").read_text())["rows"]
     assert not (out / "interrupted.json").exists() and not (out / "last.json").exists()
 
@@ -69,11 +80,9 @@ def test_ctrl_c_keeps_what_is_finished(fakes):
 def test_what_a_machine_lacks_is_skipped(
     fakes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int, device: str, skipped: list
 ):
-    out = fakes("first", "second", "third")
-    for name, on in (("second", "gpu"), ("third", "gpus")):
-        monkeypatch.setitem(suite.BENCHES, name, suite.BENCHES[name]._replace(on=on))
-    monkeypatch.setattr(suite, "_devices", lambda: (count, device))
-    assert main(["all", "--out", str(out)]) == 0
+    out = fakes("first", "second", "third", second="gpu", third="gpus")
+    monkeypatch.setattr(runner, "_devices", lambda: (count, device))
+    assert main(["run", "--out", str(out)]) == 0
     names = ["first", "second_h200", "third_h200"][: 3 - len(skipped)]
     assert sorted(path.stem for path in out.iterdir()) == names
     said = capsys.readouterr().out
@@ -85,10 +94,10 @@ def test_what_a_machine_lacks_is_skipped(
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["al"], "unknown command 'al'; did you mean 'all'?"),
-        (["all", "--only", "grid,throughputs"], "unknown bench 'throughputs'; did you mean 'throughput'?"),
+        (["ru"], "unknown command 'ru'; did you mean 'run'?"),
+        (["run", "grid", "methodss"], "unknown bench 'methodss'; did you mean 'methods'?"),
         (["compare", "nowhere", "HEAD"], "'nowhere' is neither a file of results, a folder of them nor a git revision"),
-        (["all", "--quick", "--out", str(compare.RESULTS)], "figures of --quick do not belong in bench/results"),
+        (["run", "--quick", "--out", str(records.RESULTS)], "figures of --quick, --only or --threads do not belong in"),
     ],
 )
 def test_a_mistake_is_one_sentence(argv: list[str], said: str, capsys: pytest.CaptureFixture[str]):
@@ -97,12 +106,45 @@ def test_a_mistake_is_one_sentence(argv: list[str], said: str, capsys: pytest.Ca
     assert said in captured.err and captured.err.count("\n") == 1 and not captured.out
 
 
+def test_programs_take_turns_and_failures_are_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
+    calls = []
+
+    def make(case: Case) -> Any:
+        if case.task == "no engine":
+            raise UsageError("warp is missing")
+        return lambda: measure.Program(lambda: calls.append(case.task), 10, {"physics": "fake"})
+
+    monkeypatch.setattr(measure, "environment", make)
+    cases = [Case("environment", task, num_envs=5) for task in ("a", "no engine", "b")]
+    monkeypatch.setitem(BENCHES, "fake", Bench("", cases, ()))
+    monkeypatch.setattr(measure, "FULL", measure.Effort(3, 0.0, 0.0))
+    monkeypatch.setattr("jax.config.update", lambda *_: None)
+    runner.measure("fake", tmp_path / "fake.json", quick=False, threads=0, only="", say=lambda _: None)
+    assert calls == ["a", "b"] + 3 * ["a", "b"]  # each warms up once, then they take turns
+    stored = records.load(tmp_path / "fake.json")["fake"]
+    assert stored["command"] == "python -m bench run fake"
+    a, b, failed = sorted(stored["rows"], key=lambda row: (row["task"] == "no engine", row["task"]))
+    assert (a["kind"], a["num_envs"], a["physics"], len(a["rates"])) == ("environment", 5, "fake", 3)
+    assert b["steps_per_second"] == sorted(b["rates"])[1] > 0
+    assert failed["failed"] == "UsageError: warp is missing" and "rates" not in failed
+
+
+def test_quick_and_only_choose_cases(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
+    seen = []
+    monkeypatch.setattr(measure, "rows", lambda bench, cases, effort, say: seen.append((cases, effort)) or [])
+    monkeypatch.setattr("jax.config.update", lambda *_: None)
+    for quick, only in ((True, ""), (False, "training, num_envs 256")):
+        runner.measure("ant", tmp_path / "x.json", quick, threads=0, only=only, say=lambda _: None)
+    assert seen[0] == (list(BENCHES["ant"].quick), measure.QUICK)
+    assert [(case.kind, case.num_envs) for case in seen[1][0]] == [("training", 256)]
+
+
 def test_ratios_are_below_one_for_what_became_worse():
-    old = report(steps_per_second=100.0, update_seconds=2.0, memory_gb=1.0, of_plain=0.5)
-    new = report(steps_per_second=50, update_seconds=4.0, memory_gb=0.8, of_plain=0.1)
+    old = report(steps_per_second=100.0, first_update_seconds=2.0, memory_gb=1.0, overhead=0.5)
+    new = report(steps_per_second=50, first_update_seconds=4.0, memory_gb=0.8, overhead=0.1)
     found = {change.figure: change for change in compare.changes(old, new)}
     assert found["x: steps_per_second"].ratio == 0.5  # half as many steps: worse
-    assert found["x: update_seconds"].ratio == 0.5  # twice the seconds: worse
+    assert found["x: first_update_seconds"].ratio == 0.5  # twice the seconds: worse
     assert found["x: memory_gb"].ratio == 1.25
     assert len(found) == 3
     assert compare.describe("y", old, new).splitlines()[0].startswith("y: 3 figures, 2 worse")
@@ -117,11 +159,10 @@ def test_other_machines_are_not_compared():
 
 def test_a_result_says_what_it_was_measured_on(tmp_path: pathlib.Path):
     out = tmp_path / "new" / "lane.json"
-    records.write(out, [{"task": "lane", "steps_per_second": 7}], ("scipy",), settings={"repeats": 1})
-    written = compare.load(str(out))["lane"]
-    assert {"machine", "device", "versions", "commit", "date", "load_average", "seconds"} <= set(written)
-    assert written["versions"]["scipy"] and written["settings"] == {"repeats": 1}
-    assert records.read(out) == written["rows"] and [c.ratio for c in compare.changes(written, written)] == [1.0]
+    records.write(out, [{"task": "lane", "steps_per_second": 7}], "python -m bench run lane")
+    written = records.load(out)["lane"]
+    assert {"machine", "device", "versions", "commit", "date", "load_average", "seconds", "command"} <= set(written)
+    assert written["versions"]["jax"] and [c.ratio for c in compare.changes(written, written)] == [1.0]
 
 
 def test_rows_about_the_same_thing_stay_apart():
@@ -129,24 +170,131 @@ def test_rows_about_the_same_thing_stay_apart():
     assert list(compare.figures(twice).values()) == [1, 2]
 
 
+def test_ratios_between_rows_are_taken_turn_by_turn():
+    def row(kind: str, rates: list[float], **more: Any) -> records.Row:
+        return {"kind": kind, "task": "x", "steps_per_second": float(np.median(rates)), "rates": rates, **more}
+
+    plain = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]
+    alone = row("environment", [160, 90, 170], num_envs=8, physics="mujoco")  # the machine was busy in the second turn
+    shown = tables.COLUMNS["of plain loop x threads"](alone, [*plain, alone])
+    assert shown == "0.85"  # the median of 0.8, 0.9 and 0.85
+    one, five = ({"kind": "training", "task": "x", "seeds": n, "steps_per_second": 100.0 * n / 2} for n in (1, 5))
+    assert tables.COLUMNS["x one seed"](five, [one, five]) == "1.00"
+    assert tables.COLUMNS["x one seed"](one, [one, five]) == "-"
+
+
+def test_a_table_for_each_device_and_a_failure_in_it():
+    row = {"kind": "environment", "task": "ant_2x4", "physics": "warp", "seeds": 1, "num_envs": 16_384}
+    head = {"device": "NVIDIA H200", "versions": {"jax": "1"}}
+    reports = {
+        "engines_h200": head | {"rows": [row | {"steps_per_second": 4321.0, "compile_seconds": 2.52}]},
+        "engines_b200": head | {"rows": [row | {"failed": "OutOfMemory: too much"}]},
+    }
+    said = tables.TABLES["engines"](reports)
+    assert "1 x NVIDIA H200, jax 1:" in said and "| ant_2x4 | `warp` | 1 x 16,384 | 4,321 | 2.5 |" in said
+    assert "| ant_2x4 | `warp` | 1 x 16,384 | failed: OutOfMemory | - |" in said
+    assert tables.TABLES["engines"]({}) == tables.NOT_YET
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pages
+
+
 @pytest.mark.parametrize("path", render.documents(), ids=lambda path: path.name)
 def test_documents_show_the_committed_results(path: pathlib.Path):
-    reports = compare.load(str(compare.RESULTS))
-    assert render.render(path.read_text(), reports) == path.read_text(), "run python -m bench render"
+    assert render.render(path.read_text(), records.load()) == path.read_text(), "run python -m bench render"
+
+
+def test_every_result_is_used_by_a_page_or_a_test():
+    pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))]
+    shown = {name for text in pages for _, name, _, _ in render.BLOCK.findall(text)}
+    blocks = {name.partition(":")[2] or name for name in shown}
+    benches = {tables.TABLES[name].result for name in blocks if isinstance(tables.TABLES.get(name), tables.Table)}
+    elsewhere = {"ant_paths", "hand_over_catch", *curves.FIGURES.values()}  # of pictures, and of a test
+    for file in records.RESULTS.glob("*.json"):
+        used = file.stem in blocks | elsewhere or any(
+            file.stem == name or file.stem.startswith(f"{name}_") for name in benches
+        )
+        assert used, f"no page shows {file.name}"
 
 
 def test_rendering_replaces_blocks_and_nothing_else():
-    reports = compare.load(str(compare.RESULTS))
+    reports = records.load()
     text = "before\n<!-- bench: starts -->\nold\n<!-- /bench -->\nafter\n"
     rendered = render.render(text, reports)
-    assert rendered.startswith("before\n<!-- bench: starts -->\n`pmt train") and rendered.endswith("-->\nafter\n")
+    assert rendered.startswith("before\n<!-- bench: starts -->\n") and rendered.endswith("-->\nafter\n")
+    assert "| second start | hit |" in rendered
     assert "old" not in rendered and render.render(rendered, reports) == rendered
     for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
-        with pytest.raises(compare.UsageError):
+        with pytest.raises(UsageError):
             render.render(broken, reports)
 
 
-def test_paths_of_ants_are_stored_and_drawn(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+# ---------------------------------------------------------------------------------------------------------------------
+# Stored runs
+
+
+def stored() -> dict[str, list[runs.Run]]:
+    found = {file.stem: json.loads(file.read_text()) for file in sorted(records.RESULTS.glob("*.json"))}
+    return {name: x for name, x in found.items() if isinstance(x, list) and "table" in x[0]}
+
+
+@pytest.mark.parametrize("name", stored())
+def test_settings_of_stored_runs_have_their_present_names(name: str):
+    for run in stored()[name]:
+        assert set(tomllib.loads(run.get("config", ""))) <= set(FIELDS)
+        assert all(word.split(" = ")[0] in FIELDS for word in run.get("label", "").split(", ")[1:])
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "bench" / "sweeps").glob("*.toml")), ids=lambda file: file.stem)
+def test_sweep_files_name_settings_that_there_are(file: pathlib.Path):
+    sweep = tomllib.loads(file.read_text())
+    for grid in sweep.pop("sweep"):
+        named = {*sweep, *grid, *grid["set"]} - {"extends", "set", "random"}
+        assert named <= set(FIELDS)
+
+
+def fake_run(folder: pathlib.Path, **settings: Any) -> pathlib.Path:
+    folder.mkdir(parents=True)
+    lines = ['task = "lane"', 'method = "happo"', "seeds = 2", *(f"{k} = {v}" for k, v in settings.items())]
+    (folder / "config.toml").write_text("\n".join(lines) + "\n")
+    (folder / "versions.json").write_text("{}")
+    log = [
+        {"step": step, "seed": seed, "task": "lane", "method": "happo", "cost_limit": 2.0, "seconds": 1.0}
+        | {name: (i + 1) * (step + seed) / 3 for i, name in enumerate(runs.CURVES)}
+        for step in range(1, 301)
+        for seed in (0, 1)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in log))
+    return folder
+
+
+def test_a_block_of_stored_runs_is_their_table(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    run = fake_run(tmp_path / "runs" / "x")
+    assert main(["store", str(tmp_path / "runs"), "-o", str(tmp_path / "one.json")]) == 0
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    block = "<!-- bench: curves:{} -->\n{}<!-- /bench -->\n"
+    of_runs = table.render(table.rows([run]), "markdown").split("\n\n")[0]
+    assert render.render(block.format("one", "old\n"), {}) == block.format("one", of_runs + "\n")
+    (tmp_path / "bad.json").write_text("[{}]")
+    for name in ("bad", "none"):
+        with pytest.raises(UsageError, match=f"{name}.json"):
+            render.render(block.format(name, ""), {})
+
+
+def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
+    for clip in (0.1, 0.2):
+        fake_run(tmp_path / "runs" / f"clip={clip}", clip=clip)
+    runs.store([tmp_path / "runs"], tmp_path / "points.json")
+    lines = runs.as_points(tmp_path / "points.json").splitlines()
+    assert lines[0] == "| task | method | cost | cost while training | reward |"
+    assert [line.split(" | ")[1] for line in lines[2:]] == ["happo, clip = 0.1", "happo, clip = 0.2"]
+    assert " | 100.67 [" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
+
+
+def test_paths_of_ants_are_stored_and_drawn(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     asked = []
 
     def record(folder: pathlib.Path, seed: int | None, number: int) -> SimpleNamespace:
@@ -156,82 +304,19 @@ def test_paths_of_ants_are_stored_and_drawn(tmp_path: pathlib.Path, monkeypatch:
         spec = SimpleNamespace(spec=SimpleNamespace(name="lane"))
         return SimpleNamespace(raw=raw, env=spec, reward_sum=np.array([1.0, 5.0]), cost_sum=np.array([0.0, 2.0]))
 
-    monkeypatch.setattr(paths, "record_run", record)
-    stored, drawn = tmp_path / "paths.json", tmp_path / "paths.png"
+    monkeypatch.setattr(ant_paths, "record_run", record)
+    monkeypatch.setattr(ant_paths, "EPISODES", 2)
+    files = ["--json", str(tmp_path / "paths.json"), "--png", str(tmp_path / "paths.png")]
     point = tmp_path / "method=r4sg"  # as a sweep names its folders
     point.mkdir()
-    wanted = ["Who turns=runs/x@3", "hub:ant_2x4/r4sg", f"{point}@1", f"R4SG={point}"]
-    monkeypatch.setattr("sys.argv", ["bench.paths", *wanted, "--episodes", "2", "--json", str(stored)])
-    paths.main()
+    ant_paths.main(["Who turns=runs/x@3", "hub:ant_2x4/r4sg", f"{point}@1", f"R4SG={point}", *files])
     places = [("runs/x", 3), ("hub:ant_2x4/r4sg", None), (str(point), 1), (str(point), None)]
     assert asked == [(*place, number) for place in places for number in (0, 1)]
-    first, *others = json.loads(stored.read_text())
+    first, *others = json.loads((tmp_path / "paths.json").read_text())
     assert [first["title"], *(p["title"] for p in others)] == ["Who turns", "hub:ant_2x4/r4sg", str(point), "R4SG"]
     assert first["episodes"][0] == {"x": [0, 10, 20, 30], "y": [0, 20, 40, 60], "reward": 5.0, "cost": 2.0}
-    monkeypatch.setattr("sys.argv", ["bench.paths", "--from", str(stored), "--png", str(drawn)])
-    paths.main()
-    assert drawn.read_bytes().startswith(b"\x89PNG")
-    for mistake in (["runs/lane"], []):
-        monkeypatch.setattr("sys.argv", ["bench.paths", *mistake])
-        with pytest.raises(SystemExit, match="2"):
-            paths.main()
-
-
-def test_a_block_of_curves_is_the_table_of_their_runs(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "config.toml").write_text('task = "lane"\nmethod = "happo"\nseeds = 2\n')
-    (run / "versions.json").write_text("{}")
-    names = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
-    log = [
-        {"step": step, "seed": seed, "task": "lane", "method": "happo", "cost_limit": 2.0, "seconds": 1.0}
-        | {name: (i + 1) * (step + seed) / 3 for i, name in enumerate(names)}
-        for step in range(1, 301)
-        for seed in (0, 1)
-    ]
-    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in log))
-    (tmp_path / "two.json").write_text(json.dumps([curves.compact(run)]))
-    monkeypatch.setattr(render, "RESULTS", tmp_path)
-    block = "<!-- bench: curves:two -->\n{}<!-- /bench -->\n"
-    of_runs = table.render(table.rows([run]), "markdown").split("\n\n")[0]
-    assert render.render(block.format("old\n"), {}) == block.format(of_runs + "\n")
-    (tmp_path / "two.json").write_text("[{}]")
-    for name in ("two", "none"):
-        with pytest.raises(compare.UsageError, match=f"{name}.json"):
-            render.render(block.format("").replace("two", name), {})
-
-
-def test_tables_of_a_gpu():
-    rows = [
-        {
-            "task": "ant_2x4",
-            "method": "mappo_l",
-            "physics": "warp",
-            "seeds": seeds,
-            "num_envs": 2048,
-            "rollout_length": 8,
-        }
-        | {"steps_per_second": rate, "update_seconds": took, "compile_seconds": 9.0, "memory_gb": 3.0}
-        for seeds, rate, took in ((1, 90_000, 0.2), (5, 230_000, 0.36))
-    ]
-    alone = [
-        {
-            "task": "ant_2x4",
-            "physics": "warp",
-            "seeds": 1,
-            "batch": 16_384,
-            "steps_per_second": 4,
-            "compile_seconds": 1,
-        },
-        {"task": "ant_2x4", "physics": "warp", "seeds": 5, "batch": 5120, "steps_per_second": 3, "compile_seconds": 1},
-        {"task": "voltage_33", "seeds": 1, "batch": 65_536, "failed": "OutOfMemory: too much"},
-    ]
-    head = {"device": "NVIDIA H200", "versions": {"jax": "1"}}
-    reports = {"loop_h200": {**head, "rows": rows}, "engines_h200": {**head, "rows": alone}}
-    assert "| 230,000 | 0.360 | 1.8 | 9.0 |" in tables.TABLES["loop"](reports)
-    assert "failed: OutOfMemory" in tables.TABLES["engines"](reports)
-    said = tables.TABLES["targets_h200"](reports).splitlines()
-    assert "| ant_2x4, warp, seeds 1, batch 16,384 | `steps_per_second` | >= 500,000 | 4 | **no** |" in said
-    assert any("`times_one_seed` | <= 1.5 | 1.8 | **no** |" in line for line in said)
-    assert any(line.startswith("| voltage_33") and "| failed | **no** |" in line for line in said)
-    assert any(line.startswith("| voltage_141") and "not measured yet | - |" in line for line in said)
+    ant_paths.main(files)  # again, of what is stored
+    assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SystemExit, match="2"):
+        ant_paths.main(["runs/lane", *files])
+    assert "paths are drawn of ants only" in capsys.readouterr().err

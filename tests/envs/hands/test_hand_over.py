@@ -348,7 +348,7 @@ def test_a_thousand_random_steps_break_nothing(physics):
 
 
 def test_the_egg_can_be_handed_over():
-    """Actions found by search (bench/catch.py), from the three starts that they were found on."""
+    """Actions found by search (docs/figures/hand_over.py), from the three starts that they were found on."""
     env, found = made(), json.loads(CATCH.read_text())
     actions = np.asarray(found["actions"], np.float32).reshape(75, 1, 2, 20)
     first = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))

@@ -4,8 +4,8 @@ Cross-entropy search (Rubinstein, 1999) over open-loop actions on MuJoCo's C eng
 few moments, straight lines between. A wide search comes first, a narrow one around what it found second. A candidate is
 judged by its mean return over a few starts with their own poses, places and goals.
 
-python -m bench.catch --json bench/results/hand_over_catch.json
-python -m bench.catch --from bench/results/hand_over_catch.json --png docs/hand_over.png
+    python -m docs.figures.hand_over             draws docs/hand_over.png of the actions in bench/results
+    python -m docs.figures.hand_over --search    searches for new ones first, and stores them there
 """
 
 # mujoco is a binary module without stubs:
@@ -20,13 +20,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.image
 import mujoco
 import numpy as np
 
 from envs.hands.hand_over import HORIZON, HandOver
 
+ROOT = pathlib.Path(__file__).parents[2]
+STORED = ROOT / "bench" / "results" / "hand_over_catch.json"
+
 MOMENTS = (0, 6, 12, 18, 24, 32, 44)  # control steps at which the targets are free; held after the last
-SMALLEST = 0.03  # deviation that the search keeps, in units of the action
+SMALLEST = 0.03  # standard deviation that the search keeps, in units of the action
 CANDIDATES, STARTS, FRESH = 256, 3, 64  # in each round; what they are judged on; what the result is tried on besides
 GUIDE = 30.0  # a metre nearer to the goal, at the nearest, counts this much return while searching
 # What is searched over, for each hand: both wrist motors, spread, curl at the knuckle, curl of the middle joint, palm
@@ -37,7 +41,7 @@ COSTLY, FREE = 4, 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """rounds; first deviation of the targets; share of candidates that the next are drawn around."""
+    """rounds; first standard deviation of the targets; share of candidates that the next are drawn around."""
 
     rounds: int
     deviation: float
@@ -176,23 +180,16 @@ def views_of(env: HandOver, actions: np.ndarray, moments: tuple[int, ...]) -> li
 
 
 def main() -> None:
+    """Searches, if asked, and draws; that needs OpenGL, without a screen MUJOCO_GL=egl or osmesa."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--from", dest="source", type=pathlib.Path, help="a JSON file written earlier; no search")
-    parser.add_argument("--json", type=pathlib.Path)
-    parser.add_argument("--png", type=pathlib.Path, help="needs OpenGL; MUJOCO_GL=egl or osmesa without a screen")
-    arguments = parser.parse_args()
+    parser.add_argument("--search", action="store_true")
     env = HandOver("2x6", physics="mujoco")
-    if arguments.source:
-        found = json.loads(arguments.source.read_text())
-    else:
+    if parser.parse_args().search:
         found = report(env, search(env, starts(0, STARTS)))
-    print({name: x for name, x in found.items() if name != "actions"})
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found) + "\n")
-    if arguments.png:
-        import matplotlib.image
-
-        matplotlib.image.imsave(arguments.png, picture(env, np.array(found["actions"])))
+        print({name: x for name, x in found.items() if name != "actions"})
+        STORED.write_text(json.dumps(found) + "\n")
+    actions = np.array(json.loads(STORED.read_text())["actions"])
+    matplotlib.image.imsave(ROOT / "docs" / "hand_over.png", picture(env, actions))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """The picture of the voltage tasks: the feeder at noon and a day of it, before and after control.
 
-  pip install matplotlib
-  python bench/voltage_profile.py [--task voltage_33] [--policy opf] [--day 142] [--out docs/voltage_profile.png]
+    python -m docs.figures.voltage_profile [--task voltage_33] [--policy opf] [--day 142] [--out FILE.png]
 
 Left: voltages along the feeder, by electrical distance from the substation, at the moment of the day when they are
 worst without control. Right: the lowest and highest voltage of all buses over the day. Grey is the band to keep.
@@ -80,7 +79,7 @@ def main() -> None:
     parser.add_argument("--policy", default="opf", choices=tuple(POLICIES))
     parser.add_argument("--data", default="simbench")
     parser.add_argument("--day", type=int, default=142, help="of the data; in the packaged year a sunny one in May")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "voltage_profile.png")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "voltage_profile.png")
     args = parser.parse_args()
     env = envs.make(args.task, data=args.data, noise=False)
     assert isinstance(env, VoltageControl)

@@ -1,7 +1,7 @@
 """Where ants go: paths through the corridor of a few episodes of each policy, and a picture of them.
 
-    python -m bench.paths runs/ant hub:ant_2x4/r4sg --json bench/results/ant_paths.json --png docs/ant_paths.png
-    python -m bench.paths --from bench/results/ant_paths.json --png docs/ant_paths.png
+    python -m docs.figures.ant_paths                                draws docs/ant_paths.png from bench/results
+    python -m docs.figures.ant_paths R4SG=hub:ant_2x4/r4sg runs/x   of other policies, which it stores there first
 
 Every episode is the seed's `last` policy from one of the fixed starts of evaluations, actions sampled. A run's first
 seed is shown; `NAME=FOLDER` gives a policy a title, `FOLDER@3` takes seed 3.
@@ -22,6 +22,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.render.episode import record_run
 from pmt_jax.training.compile import use_cache
 
+ROOT = pathlib.Path(__file__).parents[2]
 EPISODES = 6
 EVERY = 10  # control steps between two points of a path
 
@@ -76,26 +77,21 @@ def draw(policies: list[dict[str, Any]], file: pathlib.Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
+    """Records the paths of the policies that are named, if any, and draws those that are stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policies", nargs="*", metavar="[TITLE=]FOLDER[@SEED]")
-    parser.add_argument("--from", dest="stored", type=pathlib.Path, metavar="JSON", help="paths stored before")
-    parser.add_argument("--episodes", type=int, default=EPISODES)
-    parser.add_argument("--json", type=pathlib.Path)
-    parser.add_argument("--png", type=pathlib.Path)
-    arguments = parser.parse_args()
+    parser.add_argument("policies", nargs="*", metavar="[TITLE=]RUN[@SEED]")
+    parser.add_argument("--json", type=pathlib.Path, default=ROOT / "bench" / "results" / "ant_paths.json")
+    parser.add_argument("--png", type=pathlib.Path, default=ROOT / "docs" / "ant_paths.png")
+    arguments = parser.parse_args(words)
     use_cache()
     try:
-        found = json.loads(arguments.stored.read_text()) if arguments.stored else []
-        found += [paths(source, arguments.episodes) for source in arguments.policies]
-    except (OSError, ValueError, UsageError) as error:
+        if arguments.policies:
+            found = [paths(source, EPISODES) for source in arguments.policies]
+            arguments.json.write_text(json.dumps(found) + "\n")
+        draw(json.loads(arguments.json.read_text()), arguments.png)
+    except (OSError, UsageError) as error:
         parser.error(str(error))
-    if not found:
-        parser.error("whose paths? name run folders, pretrained policies, or a file with --from")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found) + "\n")
-    if arguments.png:
-        draw(found, arguments.png)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,236 @@
+"""What is measured: each bench is a list of cases, which take turns or run one after the other."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from pmt_jax import METHODS
+from pmt_jax.errors import UsageError
+from pmt_jax.tasks import did_you_mean
+
+Kind = Literal["plain loop", "environment", "training", "start", "checkpoint", "power flow", "baseline"]
+Settings = tuple[tuple[str, Any], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One thing to measure. What is left out stands in no row.
+
+    Attributes:
+      kind: a plain Python loop over C MuJoCo; the environment alone under random actions; the whole training loop;
+        the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned.
+      task: an environment, or a network for power flows.
+      what: which start, tool or policy.
+      method, physics, solver: of training and of the engine; the task's own where left out.
+      seeds, num_envs: side by side; of power flows the batch, of a baseline its episodes.
+      rollout_length: control steps of an environment between updates; alone, control steps in one call.
+      devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
+      settings: other settings of the training.
+    """
+
+    kind: Kind
+    task: str
+    what: str = ""
+    method: str = ""
+    physics: str = ""
+    solver: str = ""
+    seeds: int = 1
+    num_envs: int = 1
+    rollout_length: int = 0
+    devices: int = 1
+    threads: int = 0
+    settings: Settings = ()
+
+    def about(self) -> dict[str, Any]:
+        """The case as the beginning of its row."""
+        said = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "settings"}
+        defaults = {f.name: f.default for f in dataclasses.fields(self)}
+        always = ("seeds", "num_envs", "rollout_length") if self.kind in ("environment", "training") else ()
+        return {name: value for name, value in said.items() if name in always or value != defaults[name]}
+
+
+class Program(NamedTuple):
+    """What a case becomes when it is timed.
+
+    Attributes:
+      call: does its work once and waits until it is done; goes on from where it stopped.
+      steps: environment steps, or power flows, of a call, of all seeds and environments together.
+      facts: what is known before it runs, for its row.
+    """
+
+    call: Callable[[], Any]
+    steps: int
+    facts: dict[str, Any] = {}
+
+
+Build = Callable[[], Program]  # compiles
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """A list of cases, whose rows make one result.
+
+    Attributes:
+      what: what is measured, with units.
+      cases: in the order of the rows; quick: what a smoke runs instead, once.
+      on: `gpu` and `gpus` are skipped where there is none, or only one, unless asked for by name; their results are
+        called after the device, too.
+      by_turns: all programs are compiled first and take turns, so that other work on the machine hits all alike.
+    """
+
+    what: str
+    cases: Sequence[Case]
+    quick: Sequence[Case]
+    on: Literal["cpu", "gpu", "gpus"] = "cpu"
+    by_turns: bool = True
+
+
+def _alone(task: str, sizes: Iterable[int], steps: int = 0, seeds: int = 1, **engine: Any) -> tuple[Case, ...]:
+    """The environment alone; a call has 2,048 steps of all environments together unless it is told."""
+    return tuple(
+        Case("environment", task, seeds=seeds, num_envs=n, rollout_length=steps or max(4, 2048 // n), **engine)
+        for n in sizes
+    )
+
+
+def _training(task: str, method: str, seeds: int, num_envs: int, length: int, *more: Any, **engine: Any) -> Case:
+    sizes = {"seeds": seeds, "num_envs": num_envs, "rollout_length": length}
+    return Case("training", task, method=method, settings=more, **sizes, **engine)
+
+
+def _plain(task: str) -> tuple[Case, ...]:
+    return Case("plain loop", task, threads=1), Case("plain loop", task)
+
+
+def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tuple[Case, ...]:
+    """One device; then per number D of devices D times the environments, D seeds, and what one device had."""
+    cases = [_training(task, "mappo_l", 1, num_envs, length, what="one device")]
+    for count in devices:
+        for what, seeds, envs in (("weak, environments", 1, count * num_envs), ("weak, seeds", count, num_envs)):
+            cases.append(_training(task, "mappo_l", seeds, envs, length, what=what, devices=count))
+        cases.append(_training(task, "mappo_l", 1, num_envs, length, what="strong", devices=count))
+    return tuple(cases)
+
+
+# The ant's batch and networks, also on a task whose environment costs next to nothing: there the learner is alone.
+_BATCH = (("epochs", 5), ("minibatches", 8), ("hidden", (128, 128)))
+_LIKE_THE_ANT = (*_BATCH, ("activation", "relu"), ("layer_norm", True))
+_TOOLS = ("power-grid-model iterative_current", "power-grid-model newton_raphson")
+_SINGLE_TOOLS = ("lightsim2grid", "lightsim2grid, solve only", "pandapower")
+_OURS = ("ours f32", "ours f64")
+
+BENCHES = {
+    "ant": Bench(
+        "ant: control steps/s per engine beside plain loops, alone and training; seconds to start; memory, GB",
+        (
+            *(Case("start", "ant_2x4", what, method="mappo_l") for what in ("empty cache", "second start")),
+            Case("start", "ant_2x4", "256 x 64", method="mappo_l", num_envs=256, rollout_length=64),
+            *_plain("ant_2x4"),
+            *_alone("ant_2x4", (16, 64, 256), physics="mujoco"),
+            *_alone("ant_2x4", (16, 64, 256), physics="mjx", solver="fast"),
+            *_alone("ant_2x4", (16, 64, 256), physics="mjx", solver="converged"),
+            *(_training("ant_2x4", "mappo_l", 1, n, 64, physics="mujoco") for n in (16, 64, 256)),
+        ),
+        (
+            Case("start", "lane", "empty cache", method="mappo_l"),
+            *_plain("ant_2x4"),
+            *_alone("ant_2x4", (16,), physics="mujoco"),
+            _training("ant_2x4", "mappo_l", 1, 16, 64, physics="mujoco"),
+        ),
+    ),
+    "hands": Bench(
+        "hands: control steps/s per engine beside plain loops; CPU-seconds to compile",
+        (
+            *_plain("hand_over_2x6"),
+            *_alone("hand_over_2x6", (64, 256), physics="mujoco"),
+            *_alone("hand_over_2x6", (64, 256), physics="mjx"),
+        ),
+        (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
+    ),
+    "methods": Bench(
+        "every method: seconds to compile and per update, steps/s of the whole training loop",
+        (
+            *(_training("ant_2x4", method, 1, 64, 64, *_BATCH) for method in METHODS),
+            *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
+        ),
+        tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
+    ),
+    "grid": Bench(
+        "power flows/s beside other tools; environment steps/s in a scan and with a call a step",
+        (
+            *(
+                Case("power flow", network, what, num_envs=batch)
+                for network in ("case33", "case141")
+                for batch, tools in ((1024, (*_OURS, *_TOOLS)), (1, (*_OURS, *_SINGLE_TOOLS)))
+                for what in tools
+            ),
+            *(case for task in ("voltage_33", "voltage_141") for n in (60, 1) for case in _alone(task, (256,), n)),
+        ),
+        (Case("power flow", "case33", "ours f32", num_envs=1024), *_alone("voltage_33", (256,), 60)),
+    ),
+    "baselines": Bench(
+        "grids: what policies reach that are not learned, over 64 episodes",
+        tuple(
+            Case("baseline", task, what, num_envs=64)
+            for task in ("voltage_33", "voltage_141")
+            for what in ("zero", "random", "droop", "opf")
+        ),
+        (Case("baseline", "voltage_33", "zero", num_envs=2),),
+    ),
+    "checkpoint": Bench(
+        "seconds to save and load a run of the method with the most networks; MB; share of training's wall time",
+        (Case("checkpoint", "ant_2x4", method="mixed", num_envs=256),),
+        (Case("checkpoint", "lane", method="mixed", num_envs=16),),
+    ),
+    "engines": Bench(
+        "GPU: environment steps/s per engine and size; seconds to compile",
+        (
+            *_alone("ant_2x4", (1024, 4096, 16_384, 65_536), 100, physics="warp"),
+            *_alone("ant_2x4", (16_384,), 100, physics="warp", solver="fast"),
+            *_alone("ant_2x4", (1024, 2048), 100, seeds=5, physics="warp"),
+            *_alone("ant_2x4", (16_384,), 30, physics="mjx", solver="fast"),
+            *_alone("ant_2x4", (4096,), 20, physics="mjx"),
+            *_alone("hand_over_2x6", (4096, 16_384), 100, physics="warp"),
+            *_alone("hand_over_2x6", (16_384,), 100, physics="warp", solver="fast"),
+            *_alone("hand_over_2x6", (4096,), 20, physics="mjx"),
+            *(case for task in ("voltage_33", "voltage_141") for case in _alone(task, (4096, 65_536), 240)),
+        ),
+        _alone("voltage_33", (64,), 60),
+        on="gpu",
+        by_turns=False,
+    ),
+    "loop": Bench(
+        "GPU: environment steps/s of the whole training loop per method and size; memory, GB; share of time busy",
+        (
+            *(
+                _training("ant_2x4", "mappo_l", seeds, *size)
+                for size in ((128, 64), (384, 32), (512, 32), (2048, 8))
+                for seeds in (1, 5)
+            ),
+            *(_training("ant_2x4", method, 5, 2048, 8) for method in METHODS if method != "mappo_l"),
+        ),
+        tuple(_training("switch", "mappo_l", seeds, 16, 25) for seeds in (1, 2)),
+        on="gpu",
+        by_turns=False,
+    ),
+    "scaling": Bench(
+        "GPUs: environment steps/s of the whole training loop over 1, 2, 4 ... devices, and the efficiency",
+        (*_scaled("ant_2x4", 4096, 8, (2, 4, 8)), *_scaled("voltage_33", 4096, 60, (2, 4, 8))),
+        _scaled("switch", 8, 25, (2,)),
+        on="gpus",
+    ),
+}
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """The benches by these names, in the order of BENCHES; all where there is no name.
+
+    Raises:
+      UsageError: there is none by that name.
+    """
+    for name in names:
+        if name not in BENCHES:
+            raise UsageError(f"unknown bench '{name}'{did_you_mean(name, BENCHES)}")
+    return [name for name in BENCHES if not names or name in names]

@@ -1,0 +1,266 @@
+"""Cases become programs, programs take turns, turns become rows.
+
+A row says what its case is about, the median rate of its turns and the `rates` of all of them in order, so that ratios
+can be taken turn by turn, as `bench/tables.py` does. Each turn waits a while for other work on the machine to pause and
+notes how much of it went on.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import psutil
+
+import envs
+from pmt_jax import load_config, make_setup
+from pmt_jax.learning.sharding import make_mesh
+from pmt_jax.policies.evaluate import evaluate_baseline
+from pmt_jax.training.compile import compile_run
+
+from . import checkpoints, grid, plain, starts
+from .cases import Bench, Build, Case, Program
+from .records import Row
+
+UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
+
+
+class Effort(NamedTuple):
+    """How long to measure: turns of each program, seconds of a turn, seconds to wait for other work before each."""
+
+    turns: int
+    seconds: float
+    patience: float
+
+
+FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
+
+
+def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
+    """Measures cases; where one fails, its row says why."""
+    once = {"start": starts.start, "checkpoint": checkpoints.checkpoint, "baseline": baseline}
+    for case in cases:
+        if case.kind in once:
+            await_quiet(6 * effort.patience)
+            yield _told(_or_failure(case, lambda case=case: case.about() | once[case.kind](case)), say)
+    timed = [case for case in cases if case.kind not in once and case.devices <= jax.device_count()]
+    for group in [timed] if bench.by_turns else [[case] for case in timed]:
+        programs = _compiled(group, bench.on == "gpus", say)
+        turns = _take_turns(programs, effort)
+        for case, program in zip(group, programs, strict=True):
+            yield _told(program if isinstance(program, dict) else _row(case, program, turns.pop(0)), say)
+
+
+def _told(row: Row, say: Callable[[str], None]) -> Row:
+    say(str({name: value for name, value in row.items() if name != "rates"}))
+    return row
+
+
+def _or_failure(case: Case, work: Callable[[], Any]) -> Any:
+    try:
+        return work()
+    except Exception as error:  # an engine that is missing, or a device without the memory, is a result too
+        return case.about() | {"failed": f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"}
+
+
+def _compiled(cases: Sequence[Case], together: bool, say: Callable[[str], None]) -> list[Program | Row]:
+    """The programs of cases, warmed up; `together` compiles them side by side, while a costly host is held.
+
+    Engines are made one after the other: Warp starts with the first, and two threads that start it crash it.
+    """
+    make = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
+    made = [_or_failure(case, lambda case=case: make[case.kind](case)) for case in cases]
+
+    def compiled(case: Case, build: Build | Row) -> Program | Row:
+        if isinstance(build, dict):
+            return build
+        program = _or_failure(case, build)
+        say(f"compiled {', '.join(map(str, case.about().values()))}")
+        return program
+
+    with concurrent.futures.ThreadPoolExecutor(len(cases) if together else 1) as pool:
+        programs = list(pool.map(compiled, cases, made))
+    return [p if isinstance(p, dict) else _warm(case, p) for case, p in zip(cases, programs, strict=True)]
+
+
+def _warm(case: Case, program: Program) -> Program | Row:
+    failed = _or_failure(case, program.call)
+    return failed if isinstance(failed, dict) and "failed" in failed else program
+
+
+def baseline(case: Case) -> Row:
+    """Means over episodes from the starts that `pmt eval` has."""
+    found = evaluate_baseline(case.task, case.what, case.num_envs, {})
+    return {name: round(float(x[0]), 6) for name, x in found.items() if isinstance(x, tuple)}
+
+
+def environment(case: Case) -> Build:
+    """jit(scan(vmap(step))) with random actions, and with resets where an episode terminates."""
+    named = {"physics": case.physics, "solver": case.solver}
+    env = envs.make(case.task, **{name: word for name, word in named.items() if word})
+    shape = (case.seeds, case.num_envs)
+    step_all, reset_all = jax.vmap(jax.vmap(env.step)), jax.vmap(jax.vmap(env.reset))
+
+    def step(state: Any, action_and_key: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+        action, key = action_and_key
+        after = step_all(state, action)
+
+        def restarted(after: Any) -> Any:
+            def either(new: jax.Array, old: jax.Array) -> jax.Array:
+                return jnp.where(after.terminated.reshape(*shape, *[1] * (new.ndim - 2)), new, old)
+
+            return jax.tree.map(either, reset_all(jax.random.split(key, shape)), after)
+
+        return jax.lax.cond(after.terminated.any(), restarted, lambda after: after, after), after.reward.sum()
+
+    def build() -> Program:
+        actions = (case.rollout_length, *shape, env.spec.num_agents, env.spec.action_dim)
+        drawn = jax.random.uniform(jax.random.key(1), actions, minval=-1, maxval=1)  # before, as the plain loop's are
+        inputs = drawn, jax.random.split(jax.random.key(2), case.rollout_length)
+        box = [jax.jit(reset_all)(jax.random.split(jax.random.key(0), shape))]
+        begin, cpu = time.perf_counter(), time.process_time()
+        lowered = jax.jit(lambda state: jax.lax.scan(step, state, inputs)[0], donate_argnums=0).lower(box[0])
+        traced = time.process_time()
+        program = lowered.compile()
+        facts = {
+            "compile_seconds": round(time.perf_counter() - begin, 2),
+            "trace_cpu_seconds": round(traced - cpu, 1),
+            "compile_cpu_seconds": round(time.process_time() - traced, 1),
+        }
+
+        def call() -> None:
+            box[0] = jax.block_until_ready(program(box[0]))
+
+        return Program(call, case.rollout_length * case.seeds * case.num_envs, facts)
+
+    return build
+
+
+def training(case: Case) -> Build:
+    """The training loop as `pmt train` compiles it; a call is one update, on a GPU eight."""
+    updates = UPDATES["cpu" if jax.devices()[0].platform == "cpu" else "gpu"]
+    steps = updates * case.num_envs * case.rollout_length
+    sizes = {"seeds": case.seeds, "num_envs": case.num_envs, "rollout_length": case.rollout_length}
+    engine = {"physics": case.physics} if case.physics else {}
+    settings = sizes | engine | {"log_interval": updates, "steps": steps}
+    setup = make_setup(load_config(case.task, method=case.method, **settings, **dict(case.settings)))
+    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices))
+
+    def build() -> Program:
+        begin = time.perf_counter()
+        state, programs = compile_run(setup, lambda _: None)
+        facts = {"physics": setup.vector.env.engine, "compile_seconds": round(time.perf_counter() - begin, 2)}
+        box = [state]
+
+        def call() -> None:
+            box[0], _ = jax.block_until_ready(programs.chunk(box[0]))
+
+        return Program(call, case.seeds * steps, facts)
+
+    return build
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Turns
+
+
+class Turn(NamedTuple):
+    """Steps per second; CPUs that this process and others kept busy; a GPU's busy share, if there is one."""
+
+    rate: float
+    cpu: float
+    others: float
+    gpu: float | None
+
+
+def _take_turns(programs: Sequence[Program | Row], effort: Effort) -> list[list[Turn]]:
+    """The turns of each program; those that failed take none."""
+    running = [program for program in programs if isinstance(program, Program)]
+    turns: list[list[Turn]] = [[] for _ in running]
+    for _ in range(effort.turns):
+        for program, mine in zip(running, turns, strict=True):
+            await_quiet(effort.patience)
+            mine.append(_turn(program, effort.seconds))
+    return turns
+
+
+def _turn(program: Program, seconds: float) -> Turn:
+    watch, calls = Watch(), 0
+    with _busy() as busy:
+        while not calls or watch.wall < seconds:
+            program.call()
+            calls += 1
+        wall, others, own = watch.wall, watch.others, watch.own
+    return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
+
+
+def _row(case: Case, program: Program, turns: Sequence[Turn]) -> Row:
+    unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
+    busy = [turn.gpu for turn in turns if turn.gpu is not None]
+    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none
+    return {
+        **case.about(),
+        **program.facts,
+        unit: round(statistics.median(turn.rate for turn in turns), 1),
+        "rates": [round(turn.rate, 1) for turn in turns],
+        "steps_per_cpu_second": round(statistics.median(turn.rate / turn.cpu for turn in turns)),
+        "other_work_cpus": round(statistics.median(turn.others for turn in turns), 2),
+        **({"memory_gb": round(memory / 1e9, 2)} if memory else {}),
+        **({"gpu_busy": round(statistics.mean(busy), 2)} if busy else {}),
+    }
+
+
+class Watch:
+    """Seconds since it was made, CPU-seconds of this process, and how many CPUs others kept busy."""
+
+    def __init__(self) -> None:
+        self._begin, self._busy, self._cpu = time.perf_counter(), self._machine(), time.process_time()
+
+    @staticmethod
+    def _machine() -> float:
+        times = psutil.cpu_times()
+        return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
+
+    @property
+    def wall(self) -> float:
+        return time.perf_counter() - self._begin
+
+    @property
+    def own(self) -> float:
+        return time.process_time() - self._cpu
+
+    @property
+    def others(self) -> float:
+        return max(0.0, self._machine() - self._busy - self.own) / self.wall
+
+
+def await_quiet(patience: float) -> None:
+    """Waits until other work takes less than a tenth of a CPU, at most `patience` seconds."""
+    deadline = time.monotonic() + patience
+    while time.monotonic() < deadline:
+        watch = Watch()
+        time.sleep(0.3)
+        if watch.others < 0.1:
+            return
+
+
+@contextlib.contextmanager
+def _busy() -> Iterator[list[float]]:
+    """Yields a list that gets a GPU's utilisation, 0 to 1, every 100 ms; it stays empty without one."""
+    found: list[float] = []
+    if jax.devices()[0].platform != "gpu":
+        yield found
+        return
+    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits", "-i", "0", "-lms", "100"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        yield found
+        process.terminate()
+        found += [float(line) / 100 for line in process.communicate()[0].splitlines() if line.strip().isdigit()]
