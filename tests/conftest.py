@@ -7,15 +7,16 @@ import os
 import pathlib
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's complaints about programs it takes from the cache
+
+import jax
+import pytest
+
 # Tests compile far longer than they run: with the least of optimisation programs compile in a quarter of the time.
 # XLA ends a process that names a flag it does not know, and these two come and go with its versions.
 _QUICK = {"0.9": "--xla_cpu_use_fusion_emitters=false", "0.12": "--xla_cpu_opt_preset=fast_compile"}
 _MINOR = importlib.metadata.version("jaxlib").rpartition(".")[0]
 _FLAGS = ("--xla_backend_optimization_level=0", _QUICK.get(_MINOR, ""), os.environ.get("XLA_FLAGS", ""))
 os.environ["XLA_FLAGS"] = " ".join(_FLAGS)
-
-import jax
-import pytest
 
 CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
