@@ -96,6 +96,12 @@ class Hyper:
         0.05, "cost advantages are divided by their standard deviation, but never by less than this", NOT_NEGATIVE
     )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
+    fear_start: float = emotion(
+        -4.0,
+        "fear before any experience, as a logit: -4 is a probability of 0.018; nan takes the cost rate of the first "
+        "batch, for tasks whose danger is dense from the first step",
+        Bound("be a logit between -20 and 20, or nan", lambda x: math.isnan(x) or -20 <= x <= 20),
+    )
     fear_l2: float = emotion(
         1.0, "weight of fear's squared change since collection (its cognitive error)", NOT_NEGATIVE
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Literal
 
 import jax
@@ -156,6 +157,7 @@ def appraise_fear(
         signal = setup.method.cost_signal
         return None, signal(batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
+    net = dataclasses.replace(net, params=setup.nets.awaken_fear(net.params, batch.cost.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     rows = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
     if setup.config.fear_history == "random":

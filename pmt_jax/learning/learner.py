@@ -67,7 +67,9 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         cost_critic=Critic(
             init_train_state(setup.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), running_moments.init(heads)
         ),
-        fear=init_train_state(setup.nets.init_fear(tagged[Tag.FEAR])) if setup.method.cost_signal == "fear" else None,
+        fear=init_train_state(setup.nets.init_fear(tagged[Tag.FEAR], hyper.fear_start))
+        if setup.method.cost_signal == "fear"
+        else None,
         regret=(
             jax.vmap(init_train_state)(setup.nets.init_regret(tagged[Tag.REGRET]))
             if setup.method.ratio_weight == "regret"

@@ -17,9 +17,6 @@ from .maths import distributions
 from .types import Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "tanh": nn.tanh, "elu": nn.elu}
-# Nobody is afraid before the first harm: fear starts at sigmoid(-4) = 0.018. Starting at one half, it takes tens of
-# updates to come down, and all the while its noise drowns the first real danger.
-FEARLESS = -4.0
 NORM_EPS = 1e-6
 _GAINS = {"relu": math.sqrt(2), "tanh": 5 / 3, "elu": 1.0}
 
@@ -50,7 +47,6 @@ class MLP(nn.Module):
     activation: str = "relu"
     layer_norm: bool = True
     input_norm: bool = False
-    head_bias: float = 0.0
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -59,8 +55,7 @@ class MLP(nn.Module):
             x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(_GAINS[self.activation]))(x)
             x = _ACTIVATIONS[self.activation](x)
             x = LayerNorm()(x) if self.layer_norm else x
-        head_init, bias_init = nn.initializers.orthogonal(self.head_gain), nn.initializers.constant(self.head_bias)
-        return nn.Dense(self.outputs, kernel_init=head_init, bias_init=bias_init)(x)
+        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_gain))(x)
 
 
 class Actor(nn.Module):
@@ -107,9 +102,28 @@ class Networks:
         """Weights of Vc, all heads [N, K] in one network."""
         return self.cost_critic.init(key, jnp.zeros(self.state_dim))
 
-    def init_fear(self, key: jax.Array) -> Params:
-        """Weights of the fear prior network, all heads [N, K] in one."""
-        return self.fear_net.init(key, jnp.zeros(self.state_dim))
+    def init_fear(self, key: jax.Array, start: jax.Array | float) -> Params:
+        """Weights of the fear prior network, all heads [N, K] in one, whose logits begin at about `start`.
+
+        Fear begins low: from one half it takes tens of updates to come down, and its noise hides the first danger.
+        """
+        weights = self.fear_net.init(key, jnp.zeros(self.state_dim))
+        return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start))
+
+    def awaken_fear(self, params: Params, cost_rate: jax.Array) -> Params:
+        """Starts fear at the observed `cost_rate` [N, K] where it has begun at nan; other weights stay as they are."""
+        rate = jnp.clip(cost_rate, 1e-3, 1 - 1e-3)
+        bias = params["params"][self._fear_head]["bias"].reshape(rate.shape)
+        return self._with_fear_bias(params, jnp.where(jnp.isnan(bias), jnp.log(rate / (1 - rate)), bias))
+
+    @property
+    def _fear_head(self) -> str:
+        return f"Dense_{len(self.fear_net.hidden)}"
+
+    def _with_fear_bias(self, params: Params, bias: jax.Array) -> Params:
+        layers = params["params"]
+        head = {**layers[self._fear_head], "bias": bias.ravel()}
+        return {**params, "params": {**layers, self._fear_head: head}}
 
     def init_regret(self, key: jax.Array) -> Params:
         """Weights with a leading [num_agents]."""
@@ -171,9 +185,9 @@ def _apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
 def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
     """The networks of a run."""
 
-    def mlp(outputs: int, head_gain: float, head_bias: float = 0.0) -> MLP:
+    def mlp(outputs: int, head_gain: float) -> MLP:
         input_norm = config.obs_norm == "layernorm"
-        return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm, head_bias)
+        return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
 
     return Networks(
         num_actors=1 if share_actor else spec.num_agents,
@@ -184,6 +198,6 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         actor=Actor(mlp(spec.action_dim, 0.01)),
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
-        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01, FEARLESS),
+        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
         regret_net=mlp(spec.action_dim, 0.01),
     )

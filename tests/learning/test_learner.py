@@ -14,7 +14,7 @@ import pytest
 import envs
 from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
-from pmt_jax.learning import learner, policy_update, rollout
+from pmt_jax.learning import emotions, learner, policy_update, rollout
 from pmt_jax.learning.types import LearnerState, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
@@ -65,6 +65,20 @@ def test_regret_that_is_cut_to_nothing_makes_r4sg_mappo_l_and_mixed_f4sg():
     same("mixed", "f4sg")
 
 
+def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
+    """`switch` costs from the first step; with regret cut to nothing the step is that of MACPO."""
+    row = dataclasses.replace(METHODS["macpo"], ratio_weight="regret")
+    monkeypatch.setitem(METHODS, "macpo_regret", row)
+    train = jax.jit(make_train(load_config("switch", method="macpo_regret", **SMALL)))
+    hyper = make_setup(load_config("switch", method="macpo_regret", **SMALL)).hyper
+    key = jax.random.key(0)
+    without = weights(train(key, dataclasses.replace(hyper, regret_max=jnp.float32(0)))[0])
+    plain = weights(jax.tree.map(lambda x: x[0], small_run("macpo", task="switch")[0]))
+    chex.assert_trees_all_close(without, plain, rtol=1e-4, atol=1e-5)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(weights(train(key, hyper)[0])["actor"], plain["actor"], rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("response", ["one_sided", "advantage"])
 def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
     plain = weights(small_run("mappo_l", task="switch")[0])
@@ -77,7 +91,7 @@ def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
 
 
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(learner, "_appraise_fear", lambda run, hyper, net, batch, key: (net, batch.cost, {}))
+    monkeypatch.setattr(emotions, "appraise_fear", lambda setup, hyper, net, batch, key: (net, batch.cost, {}))
     fearful, _ = small_run.__wrapped__("f4sg", task="switch")
     chex.assert_trees_all_equal(weights(fearful), weights(small_run("mappo_l", task="switch")[0]))
 
@@ -185,6 +199,15 @@ def test_hyper_parameters_are_traced_and_can_be_swept():
     state, _ = jax.jit(jax.vmap(train, (None, 0)))(jax.random.key(0), sweep)
     assert len(np.unique(np.asarray(state.multiplier[:, 0, 0]))) == 3
     np.testing.assert_allclose(state.multiplier[0], 0.78)
+
+
+def test_learning_rates_decay_beyond_two_to_the_31_steps():
+    setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
+    hyper = dataclasses.replace(setup.hyper, lr_half_life=jnp.float32(1e9))
+    updates = jnp.asarray([122_070, 300_000, 2**31 - 1], jnp.int32)  # 1e9, 2.5e9 and 1.8e13 steps of a seed
+    rates = jax.vmap(lambda update: learner._annealed(setup, hyper, update).actor_lr)(updates)
+    expected = setup.config.actor_lr * 2.0 ** -(np.float64(updates) * setup.config.batch_size / 1e9)
+    np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
 
 
 def test_step_sizes_of_all_networks_halve_in_their_half_life():

@@ -1,0 +1,45 @@
+"""Where fear begins before any experience."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pmt_jax import load_config, make_setup
+from pmt_jax.learning import learner
+
+SMALL = {"num_envs": 8, "rollout_length": 25, "minibatches": 1, "epochs": 1, "hidden": (8,)}
+SETUP = make_setup(load_config("switch", "f4sg", **SMALL))
+STATES = jax.random.normal(jax.random.key(1), (50, SETUP.vector.spec.state_dim))
+
+
+def test_fear_begins_at_the_logit_that_is_asked_for():
+    for start in (-4.0, 0.5):
+        logits = SETUP.nets.fear(SETUP.nets.init_fear(jax.random.key(0), start), STATES)
+        np.testing.assert_allclose(logits, start, atol=0.05)  # the head's weights are small, not zero
+
+
+def test_without_a_start_fear_begins_at_the_cost_rate_of_the_first_batch():
+    rate = jnp.asarray([[0.3], [0.9]])
+    awake = SETUP.nets.awaken_fear(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), rate)
+    fear = jax.nn.sigmoid(SETUP.nets.fear(awake, STATES))
+    np.testing.assert_allclose(fear, jnp.broadcast_to(rate, fear.shape), atol=0.02)
+    again = SETUP.nets.awaken_fear(awake, 1 - rate)
+    jax.tree.map(np.testing.assert_array_equal, again, awake)  # once awake, it only learns
+
+
+def test_a_first_batch_without_any_cost_leaves_fear_finite():
+    awake = SETUP.nets.awaken_fear(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), jnp.zeros((2, 1)))
+    assert (jax.nn.sigmoid(SETUP.nets.fear(awake, STATES)) < 0.002).all()
+
+
+def test_an_update_from_nan_is_finite_everywhere():
+    hyper = dataclasses.replace(SETUP.hyper, fear_start=jnp.asarray(jnp.nan))
+    state, metrics = jax.jit(lambda key: learner.train_step(SETUP, hyper, learner.init(SETUP, hyper, key)))(
+        jax.random.key(0)
+    )
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.fear.params))
+    assert jnp.isfinite(metrics["fear/loss"])
