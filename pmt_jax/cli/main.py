@@ -17,6 +17,7 @@ from .. import tasks
 from ..config import settings, toml
 from ..config.methods import METHODS
 from ..errors import UsageError
+from ..output import say
 
 _METAVARS = {int: "N", float: "X"}
 _RUN = "a run folder, or a pretrained policy: hub:ant_2x4/r4sg (pmt hub lists them)"
@@ -332,16 +333,11 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.out,
         arguments.resume,
         cache=not arguments.no_cache,
-        sinks=[name for name in arguments.sink.split(",") if name],
+        loggers=[name for name in arguments.sink.split(",") if name],
         profile=arguments.profile,
         say=say,
         count=count,
     )
-
-
-def say(line: str) -> None:
-    """Prints a line at once, into a pipe too."""
-    print(line, flush=True)
 
 
 def _quiet_xla() -> None:

@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 
+from ..output import say
 from ..studies import sweep
-from .main import answer, say
+from .main import answer
 
 
 def _end_with_parent() -> None:

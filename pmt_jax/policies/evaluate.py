@@ -14,8 +14,9 @@ from ..learning.evaluation import interval, play
 from ..learning.setup import Setup
 from ..learning.types import ActingState
 from ..training.compile import evaluate_seeds
+from ..training.health import NO_ROOM
+from ..training.metrics import seed_intervals
 from ..training.run_folder import MATMUL_PRECISION, Say
-from ..training.trainer import NO_ROOM, seed_intervals
 from .load import load_run
 
 

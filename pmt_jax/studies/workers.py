@@ -57,7 +57,7 @@ def run(commands: Sequence[Sequence[str]], at_once: int, say: Say, devices: Sequ
     waiting = [(number, list(words)) for number, words in enumerate(commands, 1)]
     running: dict[subprocess.Popen[str], _Job] = {}
     code = passed_on = 0
-    with signals.noted(lambda _: None) as received:
+    with signals.noted() as received:
         while running or (waiting and not code and not received):
             while waiting and len(running) < at_once and not code and not received:
                 process, job = _start(*waiting.pop(0), _least_used(devices, running.values()), say)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import os
 import pathlib
@@ -16,17 +17,19 @@ import numpy as np
 
 from ..learning import learner, sharding
 from ..learning.evaluation import evaluate
+from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import ActingState, Hyper, LearnerState, Metrics
+from ..output import Say
 
 
 class Programs(NamedTuple):
     """The compiled programs of a run; states have a leading [seeds].
 
     Attributes:
-      chunk: state (which it consumes) -> the state `log_interval` updates later, and metrics [seeds, updates].
-      evaluate: state -> figures of `evaluate` [seeds, episodes], under mean actions; None where the run never asks.
-      take: improved [seeds] bool, best (which it consumes), state -> best, with the improved seeds' states.
+      chunk: state -> the state `log_interval` updates later, and metrics [seeds, updates], with those of `_health`.
+      evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None where the run never asks.
+      take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
     """
 
     chunk: Callable[[LearnerState], tuple[LearnerState, Metrics]]
@@ -63,10 +66,10 @@ def cache_events() -> Iterator[list[str]]:
         jax.monitoring.unregister_event_listener(listen)
 
 
-def compile_run(setup: Setup, say: Callable[[str], None]) -> tuple[LearnerState, Programs]:
+def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
     config = setup.config
-    say("compiling ...")
+    say(f"compiling {config.log_interval} update(s) of {config.method} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
     hyper, keys, axes = setup.vmap_arguments
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
@@ -75,21 +78,36 @@ def compile_run(setup: Setup, say: Callable[[str], None]) -> tuple[LearnerState,
     state = jax.jit(init, out_shardings=placement)(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
-        return learner.train_chunk(setup, hyper, state, config.log_interval)
+        state, metrics = learner.train_chunk(setup, hyper, state, config.log_interval)
+        return state, {**metrics, **_health(state)}
 
-    program = jax.jit(_over_seeds(setup, chunk, axes), donate_argnums=1, out_shardings=(placement, everywhere))
+    # The state is not donated: a seed that breaks returns to it.
+    program = jax.jit(_over_seeds(setup, chunk, axes), out_shardings=(placement, everywhere))
     with sharding.use_mesh(setup.mesh):
         lowered = program.lower(hyper, state)
     with cache_events() as events:
         compiled = lowered.compile()
     evaluation = None
     if config.eval_interval:
+        say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
         with sharding.use_mesh(setup.mesh):
             evaluation = program.lower(state).compile()
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found})")
     return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1))
+
+
+def _health(state: LearnerState) -> Metrics:
+    """Whether all that a seed has learned is finite, and the moments of its returns in units of reward and cost."""
+    learned = [
+        x for x in jax.tree.leaves(dataclasses.replace(state, rollout=None)) if jnp.issubdtype(x.dtype, jnp.floating)
+    ]
+    found = {"finite": jnp.stack([jnp.isfinite(x).all() for x in learned]).all()}
+    for name in ("critic", "cost_critic"):
+        mean, std = running_moments.centre_and_scale(getattr(state, name).returns)
+        found |= {f"{name}/return_mean": mean.mean(), f"{name}/return_std": std.mean()}
+    return found
 
 
 def evaluate_seeds(setup: Setup, episodes: int, deterministic: bool) -> Callable[[ActingState], Metrics]:
@@ -106,7 +124,5 @@ def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callab
     return jax.vmap(function, axes, spmd_axis_name=sharding.SEED if setup.mesh else None)
 
 
-def _take(improved: jax.Array, best: LearnerState, state: LearnerState) -> LearnerState:
-    return jax.vmap(lambda yes, new, old: jax.tree.map(lambda x, y: jnp.where(yes, x, y), new, old))(
-        improved, state, best
-    )
+def _take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
+    return jax.vmap(lambda yes, x, y: jax.tree.map(functools.partial(jnp.where, yes), y, x))(chosen, old, new)

@@ -7,6 +7,8 @@ import importlib.metadata
 import json
 import pathlib
 import platform
+import re
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -21,38 +23,60 @@ from ..files import read_rows, replace_text
 from ..learning import learner
 from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
+from ..output import Say
+from . import claims
 from .checkpoint import Checkpoints
+from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
-Say = Callable[[str], None]
+
+def create(setup: Setup) -> pathlib.Path:
+    """A new folder runs/TASK-METHOD-TIME, with a number behind it where another run has taken the name."""
+    task = re.sub(r"[^\w.+-]+", "-", setup.vector.spec.name).strip(".-") or "task"
+    name = f"{task}-{setup.config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
+    number = 1
+    while True:
+        out = pathlib.Path("runs") / (name if number == 1 else f"{name}-{number}")
+        try:
+            out.mkdir(parents=True)
+            return out
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise UsageError(f"cannot write into {out.parent}: {error.strerror}; choose an --out") from None
 
 
-def open_folder(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> None:
-    """Makes sure that `out` can be written and is either empty or the run to resume; writes nothing but the folder.
+def check_out(out: pathlib.Path, resume: bool) -> None:
+    """Whether `out` can be a run's folder, as far as that can be said before it is claimed; creates it.
 
     Raises:
-      UsageError: it is not, or the run was made with other settings or another physics engine.
+      UsageError: it is a file, cannot be written, or holds no run to resume.
     """
-    existing = out / "config.toml"
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, not a folder; choose another --out")
-    if resume:
-        if not existing.is_file():
-            raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
-        _same_settings(load_config(existing), setup.config, out)
-        _same_machine(out, setup, say)
-    elif out.is_dir() and any(out.iterdir()):
-        what = "another run" if existing.exists() else "other files"
-        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
+    if resume and not (out / "config.toml").is_file():
+        raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".pmt-write-test"
-        probe.touch()
-        probe.unlink()
     except OSError as error:
         raise UsageError(f"cannot write into {out}: {error.strerror}; choose another --out") from None
+
+
+def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> None:
+    """Whether a claimed folder is empty, or holds the run to resume.
+
+    Raises:
+      UsageError: it does not, or the run was made with other settings or another physics engine.
+    """
+    existing = out / "config.toml"
+    if resume:
+        _same_settings(load_config(existing), setup.config, out)
+        _same_machine(out, setup, say)
+    elif any(path.name != claims.NAME for path in out.iterdir()):
+        what = "another run" if existing.exists() else "other files"
+        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
 
 
 def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
@@ -67,11 +91,11 @@ def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
 
 
 def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
-    """Another engine computes another run; another device or version only loses the last bits, which is said."""
+    """Refuses another engine, which computes another run; says which versions changed, which costs the last bits."""
     try:
         old = json.loads((out / "versions.json").read_text())
     except (OSError, ValueError):
-        say(f"{out / 'versions.json'} cannot be read: nobody can tell whether the run began with the same engine")
+        say(f"{out / 'versions.json'} cannot be read: the engine and the versions of the run are unknown")
         return
     new = versions(setup)
     if old.get("engine", new["engine"]) != new["engine"]:
@@ -82,11 +106,11 @@ def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
         )
     changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
     if changed:
-        say(f"since the run began there changed: {', '.join(changed)}; it goes on, but perhaps not bit for bit")
+        say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
 
 
 def versions(setup: Setup) -> dict[str, Any]:
-    """What the numbers of a run depend on besides its settings."""
+    """What the results of a run depend on besides its settings."""
     found: dict[str, Any] = {name: version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1}
@@ -107,20 +131,44 @@ def write_settings(out: pathlib.Path, setup: Setup) -> None:
     replace_text(out / "versions.json", json.dumps(versions(setup), indent=2) + "\n")
 
 
-def forget_rows_after(out: pathlib.Path, step: int, say: Say) -> float:
-    """Drops what was logged after the checkpoint that the run continues from, and what was cut off in mid-line.
+def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
+    """Drops the rows after the checkpoint that the run continues from, and a line that was cut off.
+
+    Where there is no checkpoint, all rows are kept under another name.
 
     Returns:
-      the seconds of training that the rows kept tell of.
+      the rows up to `step`.
+
+    Raises:
+      UsageError: a row is not one of a run.
     """
     metrics = out / "metrics.jsonl"
-    kept = [row for row in read_rows(metrics) if row["step"] <= step]
-    last, seconds = (kept[-1]["step"], kept[-1]["seconds"]) if kept else (0, 0.0)
+    rows = read_rows(metrics)
+    for row in rows:
+        _check_number(metrics, row, "step")
+    if step == 0 and rows:
+        kept = next(path for i in range(1, 10**6) if not (path := out / f"metrics-before-{i}.jsonl").exists())
+        metrics.rename(kept)
+        say(f"there is no checkpoint in {out}: the run starts over, and its rows so far are kept in {kept.name}")
+        return []
+    rows = [row for row in rows if row["step"] <= step]
+    for row in rows:
+        _check_number(metrics, row, "seed")
+        _check_number(metrics, row, "seconds")
+    last = rows[-1]["step"] if rows else 0
     if last < step:
         say(f"{metrics} ends at step {last:,}, but the checkpoint is of step {step:,}: the rows between are lost")
     if metrics.exists():
-        replace_text(metrics, "".join(json.dumps(row) + "\n" for row in kept))
-    return seconds
+        replace_text(metrics, "".join(json.dumps(row) + "\n" for row in rows))
+    return rows
+
+
+def _check_number(metrics: pathlib.Path, row: Row, name: str) -> None:
+    if not isinstance(row.get(name), int | float) or isinstance(row[name], bool):
+        raise UsageError(
+            f"{metrics} holds a row with {name} = {json.dumps(row.get(name))}, where a number was expected; delete "
+            "that line and --resume again"
+        )
 
 
 def initial_best(state: LearnerState) -> Best:

@@ -1,27 +1,35 @@
-"""Ctrl-C and SIGTERM, noted instead of raised: an exception could land inside the physics."""
+"""Ctrl-C, SIGTERM and SIGHUP: noted instead of raised, because an exception could land inside the physics."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import socket
+import sys
+import threading
 import types
 from collections.abc import Callable, Iterator
 
+from ..output import Say, dropped_if_closed
+
+CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 @contextlib.contextmanager
-def noted(act: Callable[[int], None]) -> Iterator[list[int]]:
-    """Yields the list of the signals that have arrived; `act` is called with each at once.
+def noted() -> Iterator[list[int]]:
+    """Yields the list of the signals that have arrived.
 
-    Outside of the main thread, where signals cannot be caught, none arrives.
+    SIGHUP stays ignored under nohup. Outside of the main thread, where signals cannot be caught, none arrives.
     """
     received: list[int] = []
 
     def note(number: int, _: types.FrameType | None) -> None:
         received.append(number)
-        act(number)
 
+    wanted = [n for n in CAUGHT if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
     try:
-        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, note) for number in wanted}
     except ValueError:
         before = {}
     try:
@@ -29,3 +37,62 @@ def noted(act: Callable[[int], None]) -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class Interrupts:
+    """How a run answers signals: it ends at once, but after `save_first` it ends when the running chunk is saved.
+
+    Python's handlers wait for C++ to return, from compiling or from a long chunk. A thread reads the signals at once.
+
+    Attributes:
+      received: the numbers of the signals that have arrived.
+    """
+
+    def __init__(self, say: Say, before_exit: Callable[[], object]) -> None:
+        """`before_exit` is called before the process ends at once."""
+        self.received: list[int] = []
+        self._say, self._before_exit = say, before_exit
+        self._saves = False
+        self._stack = contextlib.ExitStack()
+
+    def save_first(self) -> None:
+        """From now on a signal is only noted; a second Ctrl-C still ends the process at once."""
+        self._saves = True
+
+    def __enter__(self) -> Interrupts:
+        self.received = self._stack.enter_context(noted())
+        read, write = socket.socketpair()
+        write.setblocking(False)
+        try:
+            before = signal.set_wakeup_fd(write.fileno(), warn_on_full_buffer=False)
+        except ValueError:  # not the main thread
+            read.close()
+            write.close()
+            return self
+        thread = threading.Thread(target=self._listen, args=(read,), daemon=True)
+        thread.start()
+        for undo in (read.close, thread.join, write.close, lambda: signal.set_wakeup_fd(before)):
+            self._stack.callback(undo)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _listen(self, pipe: socket.socket) -> None:
+        interrupted = False
+        while data := pipe.recv(1):
+            number = data[0]
+            if number in CAUGHT:
+                self._answer(number, at_once=not self._saves or (interrupted and number == signal.SIGINT))
+            interrupted |= number == signal.SIGINT
+
+    def _answer(self, number: int, at_once: bool) -> None:
+        if not at_once:
+            self._say("interrupted: saving after the running chunk; Ctrl-C again ends at once, without saving")
+            return
+        what = "what was not saved is lost" if self._saves else "nothing new was trained yet"
+        self._say(f"interrupted: {what}")
+        self._before_exit()
+        with dropped_if_closed():
+            sys.stdout.flush()
+        os._exit(128 + number)

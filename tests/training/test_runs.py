@@ -211,7 +211,7 @@ def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli
     text = metrics.read_text()
     metrics.write_text(text[: len(text) // 2])
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 200)
-    assert code == 0 and "since the run began there changed: jax 0.1 -> " in text
+    assert code == 0 and "changed since the run began: jax 0.1 -> " in text
     assert f"{metrics} ends at step 800, but the checkpoint is of step 1,600: the rows between are lost" in text
     steps = [row["step"] for row in rows(copy)]
     assert steps[-1] == STEPS + 200 and 1000 not in steps

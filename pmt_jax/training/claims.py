@@ -1,0 +1,118 @@
+"""One process at a time in a folder: a file `.claim` names the process that trains there.
+
+On one host the file is locked, and the lock ends with its process, however that ends. Locks may not reach other hosts,
+so there the name in the file counts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import pathlib
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from ..errors import UsageError
+
+NAME = ".claim"
+_held: dict[pathlib.Path, int] = {}
+
+
+@contextlib.contextmanager
+def claim(folder: pathlib.Path) -> Iterator[None]:
+    """Keeps other processes out of an existing `folder` until the end of the block.
+
+    Raises:
+      UsageError: another process has claimed it, or it cannot be written.
+    """
+    path = folder / NAME
+    try:
+        file, locked = _open(path)
+        owner = _read(file)
+        if _may_be_alive(owner, locked):
+            os.close(file)
+            raise _refusal(folder, owner)
+        _held[path] = file
+        _write(file)
+    except OSError as error:
+        _release(path)
+        raise UsageError(f"cannot write into {folder}: {error.strerror}; choose another --out") from None
+    try:
+        yield
+    finally:
+        _release(path)
+
+
+def release_all() -> None:
+    """Gives all claims of this process up, for an end at once."""
+    for path in list(_held):
+        _release(path)
+
+
+def _release(path: pathlib.Path) -> None:
+    file = _held.pop(path, None)
+    if file is not None:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        os.close(file)
+
+
+def _open(path: pathlib.Path) -> tuple[int, bool]:
+    """The descriptor of the claim file, and whether it is locked; UsageError where another process has the lock."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = _read(file)
+            os.close(file)
+            raise _refusal(path.parent, owner) from None
+        except OSError:  # a file system without locks
+            return file, False
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file), path.stat()):
+                return file, True
+        os.close(file)  # its owner has just released it
+
+
+def _read(file: int) -> dict[str, Any]:
+    """Who claimed the folder: pid, host, since; empty where the file is."""
+    try:
+        owner = json.loads(os.pread(file, 4096, 0))
+    except ValueError:
+        return {}
+    return owner if isinstance(owner, dict) else {}
+
+
+def _write(file: int) -> None:
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    os.ftruncate(file, 0)
+    os.pwrite(file, json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
+    os.fsync(file)
+
+
+def _may_be_alive(owner: dict[str, Any], locked: bool) -> bool:
+    """Whether the owner may still be at work, although this process could open its file and perhaps lock it."""
+    if not owner:
+        return False
+    if owner.get("host") != socket.gethostname():
+        return True
+    try:
+        os.kill(int(owner["pid"]), 0)
+    except (KeyError, ValueError, TypeError, ProcessLookupError):
+        return False
+    except PermissionError:
+        pass
+    return not locked
+
+
+def _refusal(folder: pathlib.Path, owner: dict[str, Any]) -> UsageError:
+    host = owner.get("host", socket.gethostname())
+    who = f"process {owner.get('pid', '?')}{'' if host == socket.gethostname() else f' on {host}'}"
+    since = f" since {owner['since']}" if "since" in owner else ""
+    gone = "" if host == socket.gethostname() else f"; if that process is gone, delete {folder / NAME}"
+    return UsageError(f"{folder} is in use by {who}{since}{gone}; wait for it, or choose another --out")

@@ -1,0 +1,81 @@
+"""Whether a seed can still train: losses that are not finite, critics that diverge, steps that broke."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import numpy as np
+
+from ..config.settings import HYPER_FIELDS
+from ..learning.setup import Setup
+from .metrics import LOSSES, Row
+
+MOST = 0.5  # share of a row's steps that may be quarantined
+MAX_RETURN = 1e8  # of a critic, in units of the reward (cost) of a step
+NO_ROOM = "the warp engine had no room for all contacts or constraints"
+
+
+def overflow(setup: Setup, rows: list[Row]) -> str | None:
+    """What is wrong, if the physics lost contacts."""
+    share = max(row[setup.overflow] for row in rows) if setup.overflow else 0.0
+    if not share:
+        return None
+    return (
+        f"{NO_ROOM} in {share:.2g} of the steps up to step {rows[0]['step']:,}, which are wrong; take another "
+        "--physics, or give make_engine more `contacts`"
+    )
+
+
+def diagnose(setup: Setup, index: int, row: Row, finite: bool) -> str | None:
+    """Why a seed cannot train on after this row; None if it can.
+
+    Args:
+      index: of the seed, from 0.
+      finite: whether all its weights and moments are.
+    """
+    steps = setup.config.batch_size * setup.config.log_interval
+    share = row["non_finite"] / steps
+    where = f"of seed {row['seed']} at step {row['step']:,}"
+    if share > MOST:
+        return (
+            f"{share:.0%} of the environment steps {where} were not finite; check the observations, rewards, costs and "
+            f"states of task '{row['task']}'"
+        )
+    lost = [name for name in LOSSES if not math.isfinite(row[name])]
+    if lost or not finite:
+        what = f"{lost[0]} {where} is {row[lost[0]]}" if lost else f"a weight {where} is not finite"
+        return f"{what}; {_cause(setup, index, share)}"
+    return _divergence(row, where)
+
+
+def _cause(setup: Setup, index: int, share: float) -> str:
+    """The likeliest reason for a loss that is not finite."""
+    if share:
+        return f"{share:.1%} of the environment steps were not finite: check the task's observations, rewards and costs"
+    extreme = ", ".join(f"{name} = {value:g}" for name, value in _extreme_settings(setup, index).items())
+    if extreme:
+        return f"single precision cannot train with {extreme}"
+    return "training diverged: try smaller learning rates (actor_lr, critic_lr, emotion_lr)"
+
+
+def _extreme_settings(setup: Setup, index: int) -> dict[str, float]:
+    """The seed's settings that overflow or divide by zero."""
+    hyper = jax.device_get(setup.vmap_arguments[0])
+    values = {name: np.asarray(getattr(hyper, name)) for name in HYPER_FIELDS}
+    own = {name: float(x[index] if x.ndim else x) for name, x in values.items()}
+    found = {name: x for name, x in own.items() if math.isfinite(x) and x > (1.0 if name.endswith("_lr") else 1e6)}
+    found = {name: x for name, x in found.items() if name not in ("lr_half_life", "cost_limit")}
+    return found | {name: x for name, x in own.items() if name == "temperature" and x < 1e-6}
+
+
+def _divergence(row: Row, where: str) -> str | None:
+    for critic, unit in (("critic", "reward"), ("cost_critic", "cost")):
+        mean, std = row[f"{critic}/return_mean"], row[f"{critic}/return_std"]
+        scale = max(1.0, abs(row[f"step_{unit}"]))
+        if max(abs(mean), std) > MAX_RETURN * scale:
+            return (
+                f"the {critic} {where} diverged: its returns are {mean:.2g} +- {std:.2g} {unit} units, where a step's "
+                f"{unit} is {row[f'step_{unit}']:.2g}; try a smaller critic_lr, gamma or gae_lambda"
+            )
+    return None

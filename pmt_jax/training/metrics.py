@@ -1,0 +1,149 @@
+"""The metrics of a run: what each of them means, and the rows of metrics.jsonl that hold them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ..learning.evaluation import interval
+from ..learning.setup import Setup
+
+Row = dict[str, Any]
+Reduction = Literal["mean", "sum", "loss"]
+
+
+class Metric(NamedTuple):
+    """A column of metrics.jsonl.
+
+    Attributes:
+      unit: of its values.
+      definition: what it measures, over the updates of one row.
+      reduction: how the updates of a row become one value. `mean` leaves out what is not finite, `loss` does not: a
+        loss that was not finite even once must show.
+    """
+
+    unit: str
+    definition: str
+    reduction: Reduction = "mean"
+
+
+METRICS: dict[str, Metric] = {
+    "step": Metric("steps", "environment steps of one seed, over all its environments"),
+    "seed": Metric("", "the seed that the row is of"),
+    "task": Metric("", "the task's name"),
+    "method": Metric("", "the method's name"),
+    "cost_limit": Metric("cost", "allowed undiscounted cost of one agent per episode"),
+    "broken": Metric("", "why the seed stopped training; null while it trains"),
+    "seconds": Metric("s", "wall time spent training since the run began, without compiling, over all its sessions"),
+    "episode_reward": Metric("reward", "undiscounted sum of the team's reward over an episode, mean over the episodes"),
+    "episode_cost": Metric("cost", "the same of one agent's cost, mean over agents"),
+    "episode_length": Metric("steps", "control steps of an episode, mean over the episodes that ended"),
+    "episodes": Metric("", "episodes that ended", "sum"),
+    "terminations": Metric("", "episodes that ended by the task's rule, not by the time limit", "sum"),
+    "true_episode_cost": Metric("cost", "episode_cost of what the costs were, where `cost_seen` or `cost_false` hides it"),
+    "true_violation_rate": Metric("", "violation_rate of what the costs were"),
+    "violation_rate": Metric("", "share of steps with a cost above 0 for some agent"),
+    "step_reward": Metric("reward", "reward of a control step"),
+    "step_cost": Metric("cost", "cost of a control step, mean over agents"),
+    "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
+    "lambda": Metric("", "the multiplier, mean over agents and costs"),
+    "cost_excess": Metric("cost per step", "how far the estimated episode cost is beyond its limit, over the horizon"),
+    "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),
+    "critic/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
+    "critic/explained_variance": Metric("", "1 - variance of the critic's error / variance of the returns"),
+    "critic/return_mean": Metric("reward", "running mean of the returns, which the critic normalises by"),
+    "critic/return_std": Metric("reward", "running standard deviation of the returns"),
+    "actor/loss": Metric("", "the policy's loss, in an update's last epoch", "loss"),
+    "actor/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
+    "actor/entropy": Metric("nats", "entropy of the policy, in an update's last epoch"),
+    "actor/std": Metric("action", "standard deviation of the actions, mean over an agent's entries"),
+    "actor/clipped": Metric("", "share of rows whose weighted probability ratio is outside the clip interval"),
+    "actor/kl_per_agent": Metric("nats", "KL(old, new) of an update, mean over the batch, agents and updates"),
+    "actor/share_of_step": Metric("", "share of an update's step that `kl_max` kept"),
+    "actor/case": Metric("", "which case of the trust-region problem was solved"),
+    "actor/line_search_steps": Metric("", "steps of the line search that were tried"),
+    "fear/loss": Metric("", "loss of the fear network, in an update's last epoch"),
+    "fear/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
+    "fear/brier": Metric("", "mean squared error of fear against the costs of a batch not learned from yet"),
+    "fear/ece": Metric("", "expected calibration error of fear, over ten equal bins"),
+    "fear/on_costly": Metric("", "mean fear where a cost followed"),
+    "fear/on_safe": Metric("", "mean fear where no cost followed"),
+    "regret/loss": Metric("", "loss of the regret networks, in an update's last epoch"),
+    "regret/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
+    "regret/on_costly": Metric("", "mean regret of an action entry on costly steps"),
+    "regret/on_safe": Metric("", "mean probability of regret of an action entry on steps without cost"),
+    "regret/weight_mean": Metric("", "mean of the weight that regret puts on the probability ratio"),
+    "regret/weight_std": Metric("", "standard deviation of that weight"),
+}
+METRICS |= {
+    name.replace("critic/", "cost_critic/", 1): metric._replace(unit=metric.unit.replace("reward", "cost"))
+    for name, metric in METRICS.items()
+    if name.startswith("critic/")
+}
+LOSSES = tuple(name for name, metric in METRICS.items() if metric.reduction == "loss")
+
+
+def describe(name: str) -> Metric:
+    """What a column of metrics.jsonl means; `info/...` is the task's own, `eval/...` is of an
+    evaluation, `.../0` is of the first cost.
+
+    Raises:
+      KeyError: there is no such metric.
+    """
+    if name.startswith("eval/"):
+        base = name.removeprefix("eval/").removesuffix("/ci95")
+        of = describe(base)
+        what = "half-width of the 95 % interval of" if name.endswith("/ci95") else "mean over evaluation episodes of"
+        return Metric(of.unit, f"{what} {base}, mean actions; null in rows without an evaluation")
+    if name.startswith("info/"):
+        return Metric("", f"the task's own `{name.removeprefix('info/')}`, mean per control step")
+    return METRICS[re.sub(r"/\d+$", "", name)]
+
+
+def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> list[Row]:
+    """A chunk's metrics [seeds, updates, ...] as one row per seed."""
+    config = setup.config
+    return [
+        {
+            "step": step,
+            "seed": config.seed + i,
+            "task": setup.vector.spec.name,
+            "method": config.method,
+            "cost_limit": float(limit),
+            "broken": None,
+            **{name: _reduce(name, np.asarray(values[i])) for name, values in metrics.items()},
+        }
+        for i, limit in enumerate(setup.cost_limits)
+    ]
+
+
+def without_metrics(row: Row, reason: str) -> Row:
+    """The row of a seed that trains no more: what names it, and nan for all that was measured."""
+    named = ("step", "seed", "task", "method", "cost_limit", "seconds")
+    return {name: x if name in named else math.nan for name, x in row.items()} | {"broken": reason}
+
+
+def _reduce(name: str, values: np.ndarray) -> float | int:
+    reduction = METRICS[name].reduction if name in METRICS else "mean"
+    if reduction == "sum":
+        return int(values.sum())
+    if reduction == "loss":
+        return float(values.mean())
+    seen = values[np.isfinite(values)]
+    return float(seen.mean()) if seen.size else math.nan
+
+
+def seed_intervals(results: Mapping[str, np.ndarray]) -> list[dict[str, tuple[float, float]]]:
+    """Of metrics [seeds, episodes]: each seed's means and half-widths of their 95 % intervals."""
+    seeds = len(next(iter(results.values())))
+    return [{name: interval(np.asarray(x[i])) for name, x in results.items()} for i in range(seeds)]
+
+
+def evaluation_columns(results: Mapping[str, tuple[float, float]]) -> Row:
+    """`eval/NAME` and its interval's half-width `eval/NAME/ci95` of one seed's evaluation."""
+    means = {f"eval/{name}": mean for name, (mean, _) in results.items()}
+    return means | {f"eval/{name}/ci95": half for name, (_, half) in results.items()}
