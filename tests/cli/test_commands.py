@@ -137,7 +137,10 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
     out = tmp_path / "broken"
     code, text, _ = cli("train", "lane", *TINY, "--steps", 2000, "--critic-lr", 1e38, "--out", out, "--no-cache")
     assert code == 1
-    assert "loss of seed 0 is" in text and "stopped" in text
+    assert (
+        "stopped: critic/loss of seed 0 at step 200 is nan; single precision cannot train with critic_lr = 1e+38"
+        in text
+    )
     assert rows(out)[-1]["step"] < 2000
 
 
