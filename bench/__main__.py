@@ -124,10 +124,16 @@ def _store(arguments: argparse.Namespace) -> int:
 
 
 def _publish(arguments: argparse.Namespace) -> int:
-    from . import publish
+    from pmt_jax.policies import publish
+    from pmt_jax.training.compile import use_cache
 
-    publish.publish_all(arguments.folders, arguments.episodes, say)
-    return 0
+    use_cache()
+    for folder in arguments.folders:
+        facts = publish.publish(folder, arguments.episodes)
+        reward, cost = (facts["figures"][f"episode_{what}"][0] for what in ("reward", "cost"))
+        say(f"{folder}: seed {facts['seed']}, {facts['which']}, reward {reward:.2f}, cost {cost:.2f}")
+    records.write(records.RESULTS / "hub.json", publish.rows(), "python -m bench publish")
+    return render.documents_anew(check=False, say=say)
 
 
 if __name__ == "__main__":

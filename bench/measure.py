@@ -23,10 +23,9 @@ import psutil
 import envs
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
-from pmt_jax.policies.evaluate import evaluate_baseline
 from pmt_jax.training.compile import compile_run
 
-from . import checkpoints, grid, plain, starts
+from . import grid, once, plain
 from .cases import Bench, Build, Case, Program
 from .records import Row
 
@@ -44,14 +43,16 @@ class Effort(NamedTuple):
 FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
 
 
+ONCE = {"start": once.start, "checkpoint": once.checkpoint, "baseline": once.baseline}
+
+
 def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
     """Measures cases; where one fails, its row says why."""
-    once = {"start": starts.start, "checkpoint": checkpoints.checkpoint, "baseline": baseline}
     for case in cases:
-        if case.kind in once:
+        if case.kind in ONCE:
             await_quiet(6 * effort.patience)
-            yield _told(_or_failure(case, lambda case=case: case.about() | once[case.kind](case)), say)
-    timed = [case for case in cases if case.kind not in once and case.devices <= jax.device_count()]
+            yield _told(_or_failure(case, lambda case=case: case.about() | ONCE[case.kind](case)), say)
+    timed = [case for case in cases if case.kind not in ONCE and case.devices <= jax.device_count()]
     for group in [timed] if bench.by_turns else [[case] for case in timed]:
         programs = _compiled(group, bench.on == "gpus", say)
         turns = _take_turns(programs, effort)
@@ -94,12 +95,6 @@ def _compiled(cases: Sequence[Case], together: bool, say: Callable[[str], None])
 def _warm(case: Case, program: Program) -> Program | Row:
     failed = _or_failure(case, program.call)
     return failed if isinstance(failed, dict) and "failed" in failed else program
-
-
-def baseline(case: Case) -> Row:
-    """Means over episodes from the starts that `pmt eval` has."""
-    found = evaluate_baseline(case.task, case.what, case.num_envs, {})
-    return {name: round(float(x[0]), 6) for name, x in found.items() if isinstance(x, tuple)}
 
 
 def environment(case: Case) -> Build:

@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bench import publish, tables
+from bench import tables
 from places import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments
 from pmt_jax.learning.types import ActingState, LearnerState, RunningMoments, TrainState
-from pmt_jax.policies import evaluate, hub, numpy_policy
+from pmt_jax.policies import evaluate, hub, numpy_policy, publish
 from pmt_jax.training import run_folder
 from pmt_jax.training.checkpoint import Checkpoints
 

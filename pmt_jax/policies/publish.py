@@ -1,11 +1,8 @@
 """Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
 
-    python -m bench publish runs/paper/ant_2x4/*    writes pmt_jax/policies/pretrained/TASK-METHOD.npz, one for each run
-    python -m bench publish                         only writes anew what is told about all of them
-
-What is told: bench/results/hub.json and the table in docs/pretrained.md. All figures are means over the same whole
-episodes under mean actions; a policy is better by the rule that `best` checkpoints are kept by (docs/runs.md), but
-those of methods without a constraint by their reward alone.
+`python -m bench publish RUN...` does so in a checkout. All figures are means over the same whole episodes under mean
+actions. A policy is better by the rule that `best` checkpoints are kept by (docs/runs.md); for methods without a
+constraint reward alone counts.
 """
 
 from __future__ import annotations
@@ -13,30 +10,26 @@ from __future__ import annotations
 import functools
 import json
 import pathlib
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pmt_jax import tasks
-from pmt_jax.errors import UsageError
-from pmt_jax.learning import rollout
-from pmt_jax.learning.evaluation import is_better
-from pmt_jax.learning.setup import Setup
-from pmt_jax.learning.types import ActingState, TrainState
-from pmt_jax.policies import hub
-from pmt_jax.policies.evaluate import evaluate_states
-from pmt_jax.policies.load import WHICH
-from pmt_jax.training.compile import use_cache
-from pmt_jax.training.run_folder import load_saved
-
-from . import records, render
+from .. import tasks
+from ..errors import UsageError
+from ..learning import rollout
+from ..learning.evaluation import is_better
+from ..learning.setup import Setup
+from ..learning.types import ActingState, TrainState
+from ..training.run_folder import load_saved
+from . import hub
+from .evaluate import evaluate_states
+from .load import WHICH
 
 
 def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
-    """Makes the best policy of a run the pretrained one of its task and method; returns what is told about it.
+    """Makes the best policy of a run the pretrained one of its task and method; returns what is known about it.
 
     Raises:
       UsageError: no run to be loaded, or one of a task that is not the package's own.
@@ -76,7 +69,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
     rows = evaluate_states(run, both, episodes, deterministic=True)
     reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
-    # Who never heard of a limit is not held to it: else MAPPO's best would be what it was before it had learned much.
+    # A limit that training did not know does not count: MAPPO's best would be a policy that has hardly learned.
     limit = np.inf if run.method.constraint == "none" else run.cost_limit
     chosen, reached = None, (np.array(-np.inf), np.array(np.inf))
     for i, new in enumerate(zip(reward, cost, strict=True)):
@@ -113,17 +106,6 @@ def action_change(run: Setup, packed: ActingState, original: ActingState, enviro
     return round(float(jax.jit(change)(jax.random.key(0), *one)), 6)
 
 
-def rows() -> records.Rows:
-    """What is told about every pretrained policy, and its size in bytes."""
+def rows() -> list[dict[str, Any]]:
+    """What is known about every pretrained policy, and its size in bytes."""
     return [{"name": name, "bytes": hub.file_of(name).stat().st_size, **hub.about(name)} for name in hub.names()]
-
-
-def publish_all(folders: Sequence[pathlib.Path], episodes: int, say: Callable[[str], None]) -> None:
-    """Publishes the best policy of each run folder, then tells of all pretrained policies anew."""
-    use_cache()
-    for folder in folders:
-        facts = publish(folder, episodes)
-        reward, cost = (facts["figures"][f"episode_{what}"][0] for what in ("reward", "cost"))
-        say(f"{folder}: seed {facts['seed']}, {facts['which']}, reward {reward:.2f}, cost {cost:.2f}")
-    records.write(records.RESULTS / "hub.json", rows(), "python -m bench publish")
-    render.documents_anew(check=False, say=say)

@@ -1,0 +1,114 @@
+"""What is measured once and takes no turns: starts, checkpoints, and policies that are not learned."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from pmt_jax import load_config, make_setup
+from pmt_jax.policies.evaluate import evaluate_baseline
+from pmt_jax.training import run_folder, trainer
+from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.compile import compile_run
+
+from .cases import Case
+from .records import Row
+
+CHUNKS, SAVES = 8, 8
+
+
+def start(case: Case) -> Row:
+    """Trains in a process of its own with an empty compile cache; the second start has what the first left in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        if case.what == "second start":
+            _train(pathlib.Path(folder), case)
+        return _train(pathlib.Path(folder), case)
+
+
+def _train(folder: pathlib.Path, case: Case) -> Row:
+    """Two updates of the case's size, or 4,096 steps of the task's own size; what they took."""
+    out = pathlib.Path(tempfile.mkdtemp(dir=folder))
+    command = [sys.executable, "-m", "pmt_jax", "train", case.task, "--method", case.method, "--log-interval", "1"]
+    command += ["--out", str(out), "--steps", str(2 * case.num_envs * case.rollout_length or 4096)]
+    if case.rollout_length:
+        command += ["--num-envs", str(case.num_envs), "--rollout-length", str(case.rollout_length)]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    begin, first = time.perf_counter(), None
+    with open(folder / f"{out.name}.log", "w+") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        while (done := os.wait4(process.pid, os.WNOHANG))[0] == 0:
+            metrics = out / "metrics.jsonl"
+            if first is None and metrics.exists() and metrics.stat().st_size:
+                first = time.perf_counter() - begin
+            time.sleep(0.01)
+        log.seek(0)
+        said = log.read()
+    if done[1] != 0 or (compiled := re.search(r"compiled in ([0-9.]+) s \(compile cache (\w+)\)", said)) is None:
+        raise RuntimeError(f"{' '.join(command)} failed: {said.strip().splitlines()[-1]}")
+    usage = done[2]
+    return {
+        "cache": compiled[2],
+        "compile_seconds": float(compiled[1]),
+        "first_update_seconds": round(first or time.perf_counter() - begin, 2),
+        "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
+        "memory_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),
+    }
+
+
+def checkpoint(case: Case) -> Row:
+    """Medians over saves, loads and chunks without the first of each, which warms up.
+
+    The run is trained for a while first, so that its weights compress as those of a real run do. `overhead` is the
+    share of wall time at the default interval, with a copy of the state after every chunk, as if each were the best.
+    """
+    setup = make_setup(load_config(case.task, method=case.method, num_envs=case.num_envs))
+    state, programs = compile_run(setup, lambda _: None)
+    box = [state, run_folder.initial_best(state)]
+
+    def train() -> None:
+        box[0], _ = programs.chunk(box[0])
+
+    def keep() -> None:
+        box[1] = run_folder.Best(programs.take(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)
+
+    chunk, copy = ([_seconds(work, box) for _ in range(CHUNKS)] for work in (train, keep))
+    saved = {"last": box[0], "best": box[1]}
+    with tempfile.TemporaryDirectory() as out:
+        kept = Checkpoints(pathlib.Path(out))
+        save = [_seconds(lambda step=step: kept.save(step, saved)) for step in range(SAVES)]
+        load = [_seconds(lambda: kept.load(saved, print)) for _ in range(SAVES)]
+        newest = pathlib.Path(out) / "checkpoints" / str(SAVES - 1)
+        size = sum(file.stat().st_size for file in newest.rglob("*") if file.is_file())
+        kept.close()
+    saving, copying, training = (statistics.median(seconds[1:]) for seconds in (save, copy, chunk))
+    return {
+        "checkpoint_mb": round(size / 1e6, 3),
+        "save_seconds": round(saving, 3),
+        "load_seconds": round(statistics.median(load[1:]), 3),
+        "overhead": round(saving / trainer.CHECKPOINT_SECONDS + copying / training, 5),
+    }
+
+
+def _seconds(work: Callable[[], Any], then: Any = None) -> float:
+    begin = time.perf_counter()
+    work()
+    jax.block_until_ready(then)
+    return time.perf_counter() - begin
+
+
+def baseline(case: Case) -> Row:
+    """Means over episodes from the starts that `pmt eval` has."""
+    found = evaluate_baseline(case.task, case.what, case.num_envs, {})
+    return {name: round(float(x[0]), 6) for name, x in found.items() if isinstance(x, tuple)}
