@@ -39,7 +39,7 @@ def empty_hub(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathli
 def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, float]) -> pathlib.Path:
     """A run folder of seeds 3 and 4 on the lane, whose policies always do about the same: push so hard."""
     run = make_setup(load_config("lane", method="r4sg", seeds=2, seed=3, num_envs=4, hidden=[8]))
-    hyper, keys, axes = run.side_by_side
+    hyper, keys, axes = run.vmap_arguments
     state = jax.jit(jax.vmap(functools.partial(learner.init, run), axes))(hyper, keys)
 
     def pushing(actions: tuple[float, float]) -> LearnerState:
@@ -51,7 +51,7 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
     out.mkdir()
     run_folder.write_settings(out, run)
     checkpoints = Checkpoints(out)
-    known = dataclasses.replace(run_folder.first_best(state), state=pushing(best))
+    known = dataclasses.replace(run_folder.initial_best(state), state=pushing(best))
     checkpoints.save(100, {"last": pushing(last), "best": known})
     checkpoints.close()
     return out
