@@ -67,16 +67,17 @@ def test_regret_that_is_cut_to_nothing_makes_r4sg_mappo_l_and_mixed_f4sg():
 
 def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
     """`switch` costs from the first step; with regret cut to nothing the step is that of MACPO."""
-    row = dataclasses.replace(METHODS["macpo"], ratio_weight="regret")
-    monkeypatch.setitem(METHODS, "macpo_regret", row)
-    train = jax.jit(make_train(load_config("switch", method="macpo_regret", **SMALL)))
-    hyper = make_setup(load_config("switch", method="macpo_regret", **SMALL)).hyper
-    key = jax.random.key(0)
+    monkeypatch.setitem(METHODS, "macpo_regret", dataclasses.replace(METHODS["macpo"], ratio_weight="regret"))
+    one_update = {**SMALL, "steps": 8 * 25}
+    config = load_config("switch", method="macpo_regret", **one_update)
+    hyper, key = make_setup(config).hyper, jax.random.key(0)
+    train = jax.jit(make_train(config))
     without = weights(train(key, dataclasses.replace(hyper, regret_max=jnp.float32(0)))[0])
-    plain = weights(jax.tree.map(lambda x: x[0], small_run("macpo", task="switch")[0]))
-    chex.assert_trees_all_close(without, plain, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_equal(without, weights(train(key, dataclasses.replace(hyper, kappa=jnp.float32(0)))[0]))
+    plain = jax.jit(make_train(load_config("switch", method="macpo", **one_update)))(key)[0]
+    chex.assert_trees_all_close(without["actor"], plain.actor.params, rtol=1e-2, atol=2e-4)
     with pytest.raises(AssertionError):
-        chex.assert_trees_all_close(weights(train(key, hyper)[0])["actor"], plain["actor"], rtol=1e-3, atol=1e-4)
+        chex.assert_trees_all_close(weights(train(key, hyper)[0])["actor"], plain.actor.params, rtol=1e-2, atol=2e-4)
 
 
 @pytest.mark.parametrize("response", ["one_sided", "advantage"])
