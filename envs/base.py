@@ -35,7 +35,8 @@ class EnvSpec:
       num_costs: K, cost functions per agent.
       horizon: control steps after which an episode is truncated.
       action_mask: [N, A], 1 where an agent has that action entry, 0 where it is padding.
-      cost_limit: the benchmark's limit on one agent's undiscounted cost per episode.
+      cost_limit: the benchmark's limit on one agent's undiscounted cost per episode: one number for every cost, or a
+        tuple of K.
     """
 
     name: str
@@ -46,7 +47,7 @@ class EnvSpec:
     num_costs: int
     horizon: int
     action_mask: np.ndarray
-    cost_limit: float
+    cost_limit: float | tuple[float, ...]
 
 
 @jax.tree_util.register_dataclass

@@ -82,6 +82,10 @@ def to_type(kind: Any, value: Any) -> Any:
     if parameters == (int, ...):
         parts = value.split(",") if isinstance(value, str) else value
         return tuple(to_type(int, part) for part in parts)
+    if float in parameters:  # a number, or one for each cost
+        parts = value.split(",") if isinstance(value, str) else value
+        several = isinstance(parts, list | tuple) and len(parts) > 1
+        return tuple(to_type(float, part) for part in parts) if several else to_type(float, value)
     return _options(value)
 
 
@@ -117,4 +121,6 @@ def expectation(kind: Any) -> str:
         return {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
     if typing.get_args(kind) == (int, ...):
         return "whole numbers, as 128,128"
+    if float in typing.get_args(kind):
+        return "a number, or one for each cost: 1,0.5"
     return "name=value"

@@ -42,6 +42,13 @@ from .fields import (
 from .methods import METHODS
 
 
+def _is_limit(value: float | tuple[float, ...]) -> bool:
+    """Whether `value` is a limit, a nan that leaves it to the task, or a limit for each cost."""
+    if isinstance(value, tuple):
+        return all(0 <= x <= FLOAT32_MAX for x in value)
+    return math.isnan(value) or 0 <= value <= FLOAT32_MAX
+
+
 @dataclasses.dataclass(frozen=True)
 class Hyper:
     """Numbers that are traced: they change or sweep without another compile."""
@@ -68,10 +75,11 @@ class Hyper:
         0.0, "weight of the policy's entropy, in nats summed over action dimensions", NOT_NEGATIVE
     )
     value_norm_decay: float = learning(0.995, "share of the running moments of returns that survives an update", SHARE)
-    cost_limit: float = constraint(
+    cost_limit: float | tuple[float, ...] = constraint(
         math.nan,
-        "allowed undiscounted cost of one agent per episode; nan takes the task's own limit",
-        Bound("be a cost per episode of at least 0", lambda x: math.isnan(x) or 0 <= x <= FLOAT32_MAX),
+        "allowed undiscounted cost of one agent per episode, one number for every cost or a list with one for each; "
+        "nan takes the task's own",
+        Bound("be a cost per episode of at least 0", lambda x: _is_limit(x)),
     )
     cost_seen: float = constraint(
         1.0,

@@ -62,11 +62,12 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
-      what the costs were before `feel`) and the task's info (means over the episode), each [episodes]; all
-      undiscounted.
+      what the costs were before `feel`), episode_cost/k of each of several costs, and the task's info (means over the
+      episode), each [episodes]; all undiscounted.
     """
     vector = tasks.VectorEnv(env, episodes)
     mask = jnp.asarray(vector.spec.action_mask)
+    several = range(vector.spec.num_costs if vector.spec.num_costs > 1 else 0)
     step_per_device = sharding.per_device(vector.step)
 
     def step(
@@ -74,7 +75,8 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
     ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
         state, alive, sums = carry
         state, outcome = step_per_device(state, act(state.env, t) * mask)
-        cost, true_cost = feel(outcome.cost, t).sum(-1), outcome.cost.sum(-1)
+        each = feel(outcome.cost, t)
+        cost, true_cost = each.sum(-1), outcome.cost.sum(-1)
         now = {
             "episode_reward": outcome.reward,
             "episode_cost": cost.mean(-1),
@@ -82,13 +84,15 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
             "violation_rate": cost.max(-1) > 0,
             "true_episode_cost": true_cost.mean(-1),
             "true_violation_rate": true_cost.max(-1) > 0,
+            **{f"episode_cost/{k}": each[..., k].mean(-1) for k in several},
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
         sums = {name: sums[name] + alive * now[name] for name in sums}
         return (state, alive & ~(outcome.terminated | outcome.truncated), sums), None
 
     start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))
-    names = ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
+    names = [f"episode_cost/{k}" for k in several]
+    names += ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
     names += ["true_episode_cost", "true_violation_rate"]
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}

@@ -147,7 +147,19 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "true_violation_rate": (true_cost.max(-1) > 0).mean(),
         "true_step_cost": true_cost.mean(),
         "non_finite": batch.non_finite.sum(),
+        **_each_cost(batch),
         **{f"info/{name}": x.mean() for name, x in batch.info.items()},
+    }
+
+
+def _each_cost(batch: Batch) -> dict[str, jax.Array]:
+    """The episode costs one by one, where there are several: `episode_cost/k` and `true_episode_cost/k`."""
+    costs = {"episode_cost": batch.episode_cost, "true_episode_cost": batch.true_episode_cost}
+    count = batch.cost.shape[-1]
+    return {
+        f"{name}/{k}": finished_mean(batch, cost[..., k].mean(-1))
+        for name, cost in costs.items()
+        for k in range(count if count > 1 else 0)
     }
 
 

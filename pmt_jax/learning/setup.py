@@ -13,6 +13,7 @@ import numpy as np
 from .. import tasks
 from ..config.methods import METHODS, Method
 from ..config.settings import HYPER_FIELDS, Config, Hyper
+from ..errors import UsageError
 from . import networks
 from .maths import running_moments
 from .types import RunningMoments
@@ -46,23 +47,29 @@ class Setup:
     mesh: jax.sharding.Mesh | None = None
 
     @property
-    def cost_limit(self) -> float:
-        """Allowed undiscounted felt cost of one agent per episode.
+    def limits(self) -> np.ndarray:
+        """Allowed undiscounted felt cost of one agent per episode: [K], one for each cost.
 
         The config's; where that is left open, what an episode that truly costs the task's limit d is expected to be
         felt as: cost_seen d + cost_false (horizon - d).
         """
-        config = self.config
-        if not math.isnan(config.cost_limit):
-            return config.cost_limit
-        limit = self.vector.spec.cost_limit
+        config, count = self.config, self.vector.spec.num_costs
+        if isinstance(config.cost_limit, tuple) or not math.isnan(config.cost_limit):
+            return np.broadcast_to(np.asarray(config.cost_limit, float), count)
+        limit = np.broadcast_to(np.asarray(self.vector.spec.cost_limit, float), count)
         return config.cost_seen * limit + config.cost_false * (self.vector.horizon - limit)
 
     @property
+    def cost_limit(self) -> float:
+        """The sum of `limits`, beside the episode cost, which is a sum over costs too."""
+        return float(self.limits.sum())
+
+    @property
     def cost_limits(self) -> np.ndarray:
-        """`cost_limit` of everything that trains side by side: [config.seeds]."""
-        limits = self.trials.hyper.cost_limit if self.trials else self.cost_limit
-        return np.broadcast_to(np.asarray(limits), self.config.seeds)
+        """`limits` of everything that trains side by side: [config.seeds, K]."""
+        limits = np.asarray(self.trials.hyper.cost_limit if self.trials else self.limits)
+        count = self.vector.spec.num_costs
+        return np.broadcast_to(limits.reshape(-1, count), (self.config.seeds, count))
 
     @property
     def overflow(self) -> str | None:
@@ -76,8 +83,9 @@ class Setup:
 
     @property
     def hyper(self) -> Hyper:
-        """The numbers of `config` that are traced, as f32 scalars; a cost limit left open is the task's."""
-        values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": self.cost_limit}
+        """The numbers of `config` that are traced, as f32 scalars; of several costs, the limits are one array [K]."""
+        limits = self.limits if self.vector.spec.num_costs > 1 else self.cost_limit
+        values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": limits}
         traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
         return Hyper(**traced)
 
@@ -101,5 +109,14 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     """
     method = METHODS[config.method]
     env = env or tasks.make(config.task, config.physics, **dict(config.env))
+    _check_limits(config, env.spec)
     nets = networks.build(config, env.spec, method.share_actor)
     return Setup(config, method, tasks.VectorEnv(env, config.num_envs), nets)
+
+
+def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:
+    count, given = spec.num_costs, np.size(config.cost_limit)
+    if given not in (1, count):
+        raise UsageError(
+            f"cost_limit has {given} numbers, but task '{spec.name}' has {count} cost(s); give one number, or {count}"
+        )

@@ -114,18 +114,32 @@ def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> lis
             "seed": config.seed + i,
             "task": setup.vector.spec.name,
             "method": config.method,
-            "cost_limit": float(limit),
+            "cost_limit": float(limits.sum()),
+            **({f"cost_limit/{k}": float(x) for k, x in enumerate(limits)} if len(limits) > 1 else {}),
             "broken": None,
             **{name: _reduce(name, np.asarray(values[i])) for name, values in metrics.items()},
         }
-        for i, limit in enumerate(setup.cost_limits)
+        for i, limits in enumerate(setup.cost_limits)
     ]
+
+
+def judged_cost(row: Row, prefix: str) -> tuple[float, float]:
+    """What a row's cost is judged by, and the limit of that: of several costs, the largest excess, and 0.
+
+    Args:
+      prefix: `eval/` to judge the evaluation, else nothing.
+    """
+    count = sum(name.startswith("cost_limit/") for name in row)
+    if not count:
+        return row[f"{prefix}episode_cost"], row["cost_limit"]
+    return max(row[f"{prefix}episode_cost/{k}"] - row[f"cost_limit/{k}"] for k in range(count)), 0.0
 
 
 def without_metrics(row: Row, reason: str) -> Row:
     """The row of a seed that trains no more: what names it, and nan for all that was measured."""
     named = ("step", "seed", "task", "method", "cost_limit", "seconds")
-    return {name: x if name in named else math.nan for name, x in row.items()} | {"broken": reason}
+    kept = {name: x for name, x in row.items() if name in named or name.startswith("cost_limit/")}
+    return {**dict.fromkeys(row, math.nan), **kept, "broken": reason}
 
 
 def _reduce(name: str, values: np.ndarray) -> float | int:

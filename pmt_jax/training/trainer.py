@@ -25,7 +25,7 @@ from . import claims, health, processes, run_folder
 from .checkpoint import Checkpoints
 from .compile import Programs, compile_run, use_cache
 from .loggers import Logger, Profile, check_loggers, open_loggers
-from .metrics import Row, evaluation_columns, make_rows, seed_intervals, without_metrics
+from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, duration
 from .signals import Interrupts
 
@@ -258,12 +258,12 @@ class Trainer:
     def _keep_best(self, rows: list[Row]) -> None:
         """Keeps each seed's state if it is the best so far, by the evaluation if there is one, else by training."""
         prefix = "eval/" if self.config.eval_interval else ""
-        reward, cost = (
-            np.asarray([math.nan if row["broken"] else row[prefix + name] for row in rows], np.float32)
-            for name in ("episode_reward", "episode_cost")
-        )
+        whole = [not row["broken"] for row in rows]
+        reward = np.where(whole, np.asarray([row[f"{prefix}episode_reward"] for row in rows], np.float32), np.nan)
+        cost, limit = np.asarray([judged_cost(row, prefix) for row in rows], np.float32).T
+        cost = np.where(whole, cost, np.nan)
         best_reward, best_cost = np.asarray(self.best.reward), np.asarray(self.best.cost)
-        improved = is_better(reward, cost, best_reward, best_cost, self.setup.cost_limits)
+        improved = is_better(reward, cost, best_reward, best_cost, limit)
         if improved.any():
             state = self.programs.take(improved, self.best.state, self.state)
             self.best = Best(state, np.where(improved, reward, best_reward), np.where(improved, cost, best_cost))
