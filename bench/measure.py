@@ -41,60 +41,60 @@ class Effort(NamedTuple):
 
 
 FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
-
-
-ONCE = {"start": once.start, "checkpoint": once.checkpoint, "baseline": once.baseline}
+Failures = dict[Case, str]
 
 
 def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
     """Measures cases; where one fails, its row says why."""
-    for case in cases:
-        if case.kind in ONCE:
-            await_quiet(6 * effort.patience)
-            yield _told(_or_failure(case, lambda case=case: case.about() | ONCE[case.kind](case)), say)
+    found, failed = {}, Failures()
+    for case in [case for case in cases if case.kind in ONCE]:
+        await_quiet(6 * effort.patience if case.kind == "start" else 0)
+        found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
+        yield _row(case, found, failed, say)
     timed = [case for case in cases if case.kind not in ONCE and case.devices <= jax.device_count()]
     for group in [timed] if bench.by_turns else [[case] for case in timed]:
-        programs = _compiled(group, bench.on == "gpus", say)
+        programs = _compiled(group, failed, bench.on == "gpus", say)
         turns = _take_turns(programs, effort)
-        for case, program in zip(group, programs, strict=True):
-            yield _told(program if isinstance(program, dict) else _row(case, program, turns.pop(0)), say)
+        found |= {case: program.facts | _medians(case, turns[case]) for case, program in programs.items()}
+        for case in group:
+            yield _row(case, found, failed, say)
 
 
-def _told(row: Row, say: Callable[[str], None]) -> Row:
+def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[str], None]) -> Row:
+    row = case.about() | ({"failed": failed[case]} if case in failed else found[case])
     say(str({name: value for name, value in row.items() if name != "rates"}))
     return row
 
 
-def _or_failure(case: Case, work: Callable[[], Any]) -> Any:
+def _attempt(failed: Failures, case: Case, work: Callable[[], Any]) -> Any:
+    """What `work` gives; an engine that is missing, or a device without the memory, is a result too."""
     try:
         return work()
-    except Exception as error:  # an engine that is missing, or a device without the memory, is a result too
-        return case.about() | {"failed": f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"}
+    except Exception as error:
+        failed[case] = f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"
 
 
-def _compiled(cases: Sequence[Case], together: bool, say: Callable[[str], None]) -> list[Program | Row]:
+def _compiled(
+    cases: Sequence[Case], failed: Failures, together: bool, say: Callable[[str], None]
+) -> dict[Case, Program]:
     """The programs of cases, warmed up; `together` compiles them side by side, while a costly host is held.
 
     Engines are made one after the other: Warp starts with the first, and two threads that start it crash it.
     """
-    make = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
-    made = [_or_failure(case, lambda case=case: make[case.kind](case)) for case in cases]
+    builds = {case: _attempt(failed, case, lambda case=case: MAKE[case.kind](case)) for case in cases}
 
-    def compiled(case: Case, build: Build | Row) -> Program | Row:
-        if isinstance(build, dict):
-            return build
-        program = _or_failure(case, build)
+    def compiled(case: Case) -> Program | None:
+        program = _attempt(failed, case, builds[case])
         say(f"compiled {', '.join(map(str, case.about().values()))}")
         return program
 
-    with concurrent.futures.ThreadPoolExecutor(len(cases) if together else 1) as pool:
-        programs = list(pool.map(compiled, cases, made))
-    return [p if isinstance(p, dict) else _warm(case, p) for case, p in zip(cases, programs, strict=True)]
-
-
-def _warm(case: Case, program: Program) -> Program | Row:
-    failed = _or_failure(case, program.call)
-    return failed if isinstance(failed, dict) and "failed" in failed else program
+    sound = [case for case in cases if case not in failed]
+    with concurrent.futures.ThreadPoolExecutor(max(1, len(sound)) if together else 1) as pool:
+        programs = dict(zip(sound, pool.map(compiled, sound), strict=True))
+    for case, program in programs.items():
+        if program:
+            _attempt(failed, case, program.call)
+    return {case: program for case, program in programs.items() if program and case not in failed}
 
 
 def environment(case: Case) -> Build:
@@ -163,6 +163,10 @@ def training(case: Case) -> Build:
     return build
 
 
+ONCE = {"start": once.start, "checkpoint": once.checkpoint, "baseline": once.baseline}
+MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Turns
 
@@ -176,14 +180,13 @@ class Turn(NamedTuple):
     gpu: float | None
 
 
-def _take_turns(programs: Sequence[Program | Row], effort: Effort) -> list[list[Turn]]:
-    """The turns of each program; those that failed take none."""
-    running = [program for program in programs if isinstance(program, Program)]
-    turns: list[list[Turn]] = [[] for _ in running]
+def _take_turns(programs: dict[Case, Program], effort: Effort) -> dict[Case, list[Turn]]:
+    """The turns of each program."""
+    turns: dict[Case, list[Turn]] = {case: [] for case in programs}
     for _ in range(effort.turns):
-        for program, mine in zip(running, turns, strict=True):
+        for case, program in programs.items():
             await_quiet(effort.patience)
-            mine.append(_turn(program, effort.seconds))
+            turns[case].append(_turn(program, effort.seconds))
     return turns
 
 
@@ -197,13 +200,11 @@ def _turn(program: Program, seconds: float) -> Turn:
     return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
 
 
-def _row(case: Case, program: Program, turns: Sequence[Turn]) -> Row:
+def _medians(case: Case, turns: Sequence[Turn]) -> Row:
     unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
     busy = [turn.gpu for turn in turns if turn.gpu is not None]
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none
     return {
-        **case.about(),
-        **program.facts,
         unit: round(statistics.median(turn.rate for turn in turns), 1),
         "rates": [round(turn.rate, 1) for turn in turns],
         "steps_per_cpu_second": round(statistics.median(turn.rate / turn.cpu for turn in turns)),

@@ -114,7 +114,7 @@ def test_programs_take_turns_and_failures_are_rows(monkeypatch: pytest.MonkeyPat
             raise UsageError("warp is missing")
         return lambda: measure.Program(lambda: calls.append(case.task), 10, {"physics": "fake"})
 
-    monkeypatch.setattr(measure, "environment", make)
+    monkeypatch.setitem(measure.MAKE, "environment", make)
     cases = [Case("environment", task, num_envs=5) for task in ("a", "no engine", "b")]
     monkeypatch.setitem(BENCHES, "fake", Bench("", cases, ()))
     monkeypatch.setattr(measure, "FULL", measure.Effort(3, 0.0, 0.0))
