@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from pmt_jax.errors import UsageError
+from pmt_jax.formats import markdown
 from pmt_jax.studies import plot, table
-from pmt_jax.studies.statistics import bootstrap_interval
+from pmt_jax.studies.rows import Row, in_order, rows
+from pmt_jax.studies.run_log import RunLog, groups, read_all
+from pmt_jax.studies.statistics import mean_interval
 
 from . import records
-from .tables import markdown
 
 Run = dict[str, Any]
 
@@ -25,10 +27,7 @@ WHILE_TRAINING = "cost while training"
 
 def store(folders: Sequence[pathlib.Path], out: pathlib.Path) -> int:
     """Writes the run folders among and below `folders` into a JSON file; returns how many there are."""
-    found = [_compact(folder) for folder in table.find_runs(folders)]
-    labels = plot.labels([curves(run) for run in found])
-    for run, label in zip(found, labels, strict=True):
-        run["label"] = label
+    found = [_compact(run) | {"label": group.label} for group in groups(read_all(folders)) for run in group.runs]
     out.write_text(json.dumps(found) + "\n")
     return len(found)
 
@@ -48,27 +47,27 @@ def load(file: pathlib.Path) -> list[Run]:
     return found
 
 
-def _compact(folder: pathlib.Path) -> Run:
+def _compact(log: RunLog) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
     Curves are {name: [seeds][points]}, None where unknown; `table` is {column: [seeds]}, see `pmt_jax.studies.table`,
     and the mean cost of all episodes while it trained.
     """
-    found, (row,) = plot.read(folder, CURVES), table.rows([folder])
-    figures = row.figures | {WHILE_TRAINING: np.nanmean(found.figures["episode_cost"], axis=1)}
+    found, (row,) = log.thinned(plot.POINTS), rows([log])
+    scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
     return {
         "steps": found.steps.tolist(),
         "seeds": list(found.seeds),
-        **{name: [[_rounded(x) for x in seed] for seed in found.figures[name]] for name in CURVES},
-        "table": {column: [_rounded(x) for x in seeds] for column, seeds in figures.items()},
+        **{name: [[_rounded(x) for x in seed] for seed in found.metrics[name]] for name in CURVES},
+        "table": {column: [_rounded(x) for x in seeds] for column, seeds in scores.items()},
         "source": row.source,
         "task": found.task,
         "method": found.method,
         "cost_limit": found.cost_limit,
-        "seconds": found.seconds,
-        "versions": json.loads((folder / "versions.json").read_text()),
+        "seconds": float(np.nanmax(log.metrics["seconds"])),
+        "versions": log.versions,
         "commit": (records.git("rev-parse", "--short", "HEAD") or "unknown").strip(),
-        "config": (folder / "config.toml").read_text(),
+        "config": (log.folder / "config.toml").read_text(),
     }
 
 
@@ -76,30 +75,28 @@ def _rounded(x: float) -> float | None:
     return float(f"{x:.6g}") if np.isfinite(x) else None
 
 
-def curves(run: Run) -> plot.Curves:
+def curves(run: Run) -> RunLog:
     """A stored run as `pmt plot` has it."""
-    return plot.Curves(
-        names=(run["task"],),
+    return RunLog(
+        folder=pathlib.Path(run["task"]),
         task=run["task"],
         method=run["method"],
         cost_limit=run["cost_limit"],
         settings=tomllib.loads(run["config"]),
         seeds=tuple(run["seeds"]),
         steps=np.array(run["steps"]),
-        figures={name: np.array(run[name], float) for name in CURVES},
-        seconds=run["seconds"],
+        metrics={name: np.array(run[name], float) for name in CURVES},
     )
 
 
 def as_pmt_table(file: pathlib.Path) -> str:
     """The table that `pmt table` makes of the runs, without the sentences below it that say what its figures mean."""
-    rows = table.in_order([_row(run) for run in load(file)])
-    return table.render(rows, "markdown").split("\n\n")[0]
+    return table.render(in_order([_row(run) for run in load(file)]), "markdown").split("\n\n")[0]
 
 
-def _row(run: Run) -> table.Row:
-    figures = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
-    return table.Row(run["task"], run["method"], "", run["cost_limit"], max(run["steps"]), run["source"], figures)
+def _row(run: Run) -> Row:
+    scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
+    return Row(run["task"], run["method"], "", run["cost_limit"], max(run["steps"]), run["source"], scores)
 
 
 def as_points(file: pathlib.Path) -> str:
@@ -108,7 +105,7 @@ def as_points(file: pathlib.Path) -> str:
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
     def cell(values: list[float]) -> str:
-        low, high = bootstrap_interval([values], np.mean)
+        low, high = mean_interval(values)
         return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
 
     body = [[run["task"], run.get("label", run["method"]), *(cell(run["table"][c]) for c in present)] for run in found]

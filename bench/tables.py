@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import statistics
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
+
+from pmt_jax.formats import markdown
 
 from .compare import on_cpu
 from .records import Report, Row, Rows
@@ -17,12 +19,6 @@ from .records import Report, Row, Rows
 Reports = dict[str, Report]
 Figure = Callable[[Row, Rows], float | None]
 NOT_YET = "*Not measured yet.*"
-
-
-def markdown(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(line) + " |" for line in (head, *body)]
-    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
 
 
 def where(report: Report) -> str:

@@ -1,17 +1,21 @@
-"""How tables name a task's figures; imports nothing, so that tables need neither JAX nor MuJoCo."""
+"""How tables name a task's metrics; imports nothing of ours, so that tables need neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 
 class Column(NamedTuple):
-    """A figure of a task's `info` as a column of tables.
+    """A metric of a task's `info` as a column of tables.
 
     Attributes:
       name: the column's head.
-      definition: what the figure means and in which unit, the rest of a sentence that begins with the name.
+      definition: what the metric means and in which unit, the rest of a sentence that begins with the name.
+      low, high: no value lies beyond; intervals are cut there.
     """
 
     name: str
     definition: str
+    low: float = -math.inf
+    high: float = math.inf

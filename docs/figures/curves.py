@@ -28,7 +28,7 @@ def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     for name in names or FIGURES:
         found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
-        plot.draw([runs.curves(run) for run in found], DOCS / f"{name}.png")
+        plot.draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png")
         print(f"docs/{name}.png")
 
 

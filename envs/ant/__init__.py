@@ -4,6 +4,6 @@ from ..columns import Column
 
 COLUMNS = {
     "outside": Column(
-        "outside", "share of steps beyond a wall; walls do not block, and behind their bands nothing costs"
+        "outside", "share of steps beyond a wall; walls do not block, and behind their bands nothing costs", 0, 1
     )
 }

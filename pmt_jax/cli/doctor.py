@@ -17,7 +17,7 @@ from .. import tasks
 from ..errors import UsageError
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-EXTRAS = {"warp-lang": "warp", "matplotlib": "render", "brax": "render", "tensorboardX": "log", "wandb": "log"}
+EXTRAS = {"warp-lang": "warp", "imageio-ffmpeg": "render", "brax": "adapters", "tensorboardX": "log", "wandb": "log"}
 GL_BACKENDS = ("egl", "osmesa", "glfw")
 _CACHE_PROBE = """
 import jax

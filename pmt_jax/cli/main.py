@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import os
 import pathlib
-import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -191,15 +190,18 @@ def _add_sweep(commands: Any) -> None:
         description="Trains every combination of the --set values; the same command goes on where it was interrupted.",
         allow_abbrev=False,
     )
-    sweep.add_argument("source", metavar="TASK|CONFIG", help="as for pmt train")
+    sweep.add_argument("source", metavar="TASK|CONFIG", help="as for pmt train, or a TOML file with [[sweep]] tables")
     sweep.add_argument(
         "--set",
         action="append",
-        required=True,
+        default=[],
         dest="vary",
         metavar="NAME=VALUE,...",
-        help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]",
+        help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]; "
+        "or with --random a range: NAME=LOW:HIGH, NAME=log:LOW:HIGH",
     )
+    sweep.add_argument("--random", default="0", metavar="N", help="draw N values from each range of --set")
+    sweep.add_argument("--draw-seed", default="0", metavar="N", help="of these draws (default 0)")
     sweep.add_argument("--out", type=pathlib.Path, required=True, help="the folder that gets a run folder per point")
     sweep.add_argument("--no-cache", action="store_true", help="do not keep compiled programs on disk")
     _add_jobs(sweep)
@@ -218,11 +220,12 @@ def _add_table(commands: Any) -> None:
     table = commands.add_parser(
         "table",
         help="compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
-        description="One row per task, method and settings: interquartile means with 95 % bootstrap intervals.",
+        description="One row per task, method and settings: interquartile means with 95 % intervals.",
         allow_abbrev=False,
     )
     table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
+    table.add_argument("--test", action="store_true", help="also test against it: Mann-Whitney's U, Holm's correction")
     _add_format(table)
     table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
     table.set_defaults(run=_table)
@@ -371,13 +374,21 @@ def _eval(arguments: argparse.Namespace) -> int:
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
-    vary = dict(_values(word) for word in arguments.vary)
+    from ..studies.points import from_file, from_words, has_parts, make_points
+
+    draws, seed = _whole("--random", arguments.random, 0), _whole("--draw-seed", arguments.draw_seed, 0)
+    if has_parts(arguments.source) and (arguments.vary or draws):
+        raise UsageError(f"{arguments.source} says itself what to sweep; leave out --set and --random")
+    if not (arguments.vary or has_parts(arguments.source)):
+        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
+    words = arguments.vary
+    parts = [from_words(arguments.source, words, draws, seed)] if words else from_file(arguments.source)
+    points = make_points(parts, arguments.preset, **_given(arguments))
     count = _optional("--devices", arguments.devices, 1)
     at_once = _alone("pmt sweep", arguments.jobs)
     from ..studies import sweep
 
-    points = sweep.grid(arguments.source, vary, arguments.preset, **_given(arguments))
-    return sweep.sweep(points, arguments.out, sweep.Launch(not arguments.no_cache, say, count, at_once))
+    return sweep.sweep(parts, points, arguments.out, sweep.Launch(not arguments.no_cache, say, count, at_once))
 
 
 def _alone(command: str, jobs: str) -> int:
@@ -395,39 +406,30 @@ def _alone(command: str, jobs: str) -> int:
     return at_once
 
 
-def _values(word: str) -> tuple[str, list[str]]:
-    """NAME=VALUE,... as the name and its values."""
-    name, _, values = word.partition("=")
-    if not values:
-        raise UsageError(f"--set takes NAME=VALUE,VALUE,..., not '{word}'")
-    if name == "task":
-        raise UsageError("a sweep has one task; sweep each of them with its own --out")
-    parts = re.findall(r"\[[^\]]*\]|[^,]+", values)
-    return name.replace("-", "_"), [part.strip("[]") for part in parts]
-
-
 def _table(arguments: argparse.Namespace) -> int:
+    from ..files import writing
     from ..studies import table
+    from ..studies.rows import rows
+    from ..studies.run_log import read_all
 
-    text = table.render(table.rows(table.find_runs(arguments.sources)), arguments.format, arguments.baseline)
+    found = rows(read_all(arguments.sources))
+    text = table.render(found, arguments.format, arguments.baseline, arguments.test)
     if arguments.output is None:
         print(text, end="")
         return 0
-    try:
-        arguments.output.write_text(text)
-    except OSError as error:
-        raise UsageError(f"cannot write {arguments.output}: {error.strerror}; choose another -o") from None
+    with writing(arguments.output) as partial:
+        partial.write_text(text)
     return 0
 
 
 def _reproduce(arguments: argparse.Namespace) -> int:
     count = _optional("--devices", arguments.devices, 1)
     at_once = _alone("pmt reproduce", arguments.jobs)
-    from ..studies import sweep
+    from ..studies import reproduce, sweep
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
     launch = sweep.Launch(not arguments.no_cache, say, count, at_once)
-    return sweep.reproduce(arguments.table, arguments.budget, out, arguments.format, launch)
+    return reproduce.reproduce(arguments.table, arguments.budget, out, arguments.format, launch)
 
 
 def _whole(flag: str, text: str, least: int) -> int:

@@ -252,7 +252,10 @@ HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
 
 
 def load_config(
-    source: str | pathlib.Path, method: str | None = None, preset: str = "default", **overrides: Any
+    source: str | pathlib.Path | dict[str, Any],
+    method: str | None = None,
+    preset: str = "default",
+    **overrides: Any,
 ) -> Config:
     """Settings of a task: defaults, then the file, its [method.NAME] table, the preset, then `overrides`.
 
@@ -260,7 +263,7 @@ def load_config(
 
     Args:
       source: a name in configs/ (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
-        or a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`).
+        a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
       method: a name in METHODS; the file's own choice if None.
       preset: a file of configs/presets.
       **overrides: any field of Config.
@@ -272,7 +275,8 @@ def load_config(
       >>> load_config("lane", method="happo", num_envs=8).num_envs
       8
     """
-    table = {"task": str(source)} if is_file(str(source)) else toml.read(source)
+    table = source if isinstance(source, dict) else _read(source)
+    source = "a [[sweep]]" if isinstance(source, dict) else source
     own = table.get("method")
     method = method or (own if isinstance(own, str) else str(Config.method))
     if method not in METHODS:
@@ -284,6 +288,13 @@ def load_config(
     if "task" in values:
         values["task"] = absolute(str(values["task"]))
     return Config(**{name: convert(name, value) for name, value in values.items()} | {"method": method})
+
+
+def _read(source: str | pathlib.Path) -> dict[str, Any]:
+    table = {"task": str(source)} if is_file(str(source)) else toml.read(source)
+    if "sweep" in table:
+        raise UsageError(f"{source} describes a sweep of many runs: pmt sweep {source} --out DIR")
+    return table
 
 
 def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) -> dict[str, Any]:

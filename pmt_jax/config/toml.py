@@ -84,12 +84,12 @@ def _resolve(path: pathlib.Path, below: tuple[pathlib.Path, ...]) -> Table:
     chain = (*below, path.resolve())
     if found.resolve() in chain:
         raise UsageError(f"{path} extends '{base}', which extends it in turn")
-    return _over(_resolve(found, chain), table)
+    return over(_resolve(found, chain), table)
 
 
-def _over(base: Table, top: Table) -> Table:
+def over(base: Table, top: Table) -> Table:
     """`top` laid over `base`, tables within them key by key."""
-    both = {key: _over(base[key], top[key]) for key in base.keys() & top.keys() if _tables(base[key], top[key])}
+    both = {key: over(base[key], top[key]) for key in base.keys() & top.keys() if _tables(base[key], top[key])}
     return {**base, **top, **both}
 
 

@@ -64,8 +64,6 @@ def render(
         raise UsageError(f"cannot write {out}: its ending must be .mp4, .gif or .html")
     if out.suffix == ".mp4":
         optional("imageio_ffmpeg", "render")
-    if out.suffix != ".html":
-        optional("PIL", "render")
     episode = record_run(folder, seed, number, deterministic).cut(moments)
     if not len(episode):
         raise UsageError("the episode has no such steps; leave --steps out to see how long it is")
@@ -146,7 +144,6 @@ def _bodies(episode: Episode, size: tuple[int, int], platform: str) -> Iterator[
 
 
 def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    optional("matplotlib", "render")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure

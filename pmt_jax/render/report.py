@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import html
-import json
 import math
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..errors import UsageError, optional
+from ..errors import UsageError
 from ..files import writing
+from ..policies import evaluate
 from ..studies import plot
-
-# ---------------------------------------------------------------------------------------------------------------------
-# plot.Curves
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The page
+from ..studies.run_log import Group, RunLog, read_all
+from . import episode, page
 
 
 def report(
@@ -32,71 +27,91 @@ def report(
     What a run lacks (a checkpoint, say) is told in its place; the rest of the page is made.
 
     Args:
+      folders: runs, or folders of runs; what holds none is left out with a note.
       out: an .html file.
       episodes: of the evaluation, per seed and kind of action.
 
     Raises:
-      UsageError: a folder without figures, another ending, matplotlib missing, or `out` that cannot be written.
+      UsageError: no run at all, another ending, or `out` that cannot be written.
     """
-    from . import page
-
     if out.suffix != ".html":
         raise UsageError(f"cannot write {out}: the ending of a report must be .html")
-    optional("matplotlib", "render")
-    runs = [plot.read(folder) for folder in folders]
-    body = [*_heading(runs), *_curve_sections(plot.pool(runs))]
-    for folder, run in zip(folders, runs, strict=True):
-        say(f"evaluating {folder} ...")
-        body.append(f"<section>\n<h2>{html.escape(folder.name)}</h2>")
-        body.append(f"<p>{html.escape(_summary(run))}</p>")
-        body += _or_reason(lambda folder=folder: _evaluation(folder, episodes))
-        body += _or_reason(lambda folder=folder: _replay(folder))
-        body += [*_details("Settings", run.settings), *_details("Versions", _versions(folder)), "</section>"]
+    logs = read_all(folders, say)
+    title = _title(logs)
+    body = [*_heading(title, logs), *_curve_sections(plot.pooled(logs, say))]
+    for log in logs:
+        say(f"evaluating {log.folder} ...")
+        body += _run_section(log, episodes)
     with writing(out) as partial:
-        partial.write_text(page.page(_title(runs), body))
+        partial.write_text(page.page(title, body))
 
 
-def _title(runs: Sequence[plot.Curves]) -> str:
-    methods, tasks = (
-        ", ".join(dict.fromkeys(words)) for words in zip(*((r.method, r.task) for r in runs), strict=True)
-    )
+def _title(logs: Sequence[RunLog]) -> str:
+    methods, tasks = (", ".join(dict.fromkeys(x)) for x in zip(*((r.method, r.task) for r in logs), strict=True))
     return f"{methods} on {tasks}"
 
 
-def _heading(runs: Sequence[plot.Curves]) -> list[str]:
-    seeds = sum(len(run.seeds) for run in runs)
-    many = f"{len(runs)} run{'s' * (len(runs) != 1)}, {seeds} seed{'s' * (seeds != 1)} in all."
-    return [f"<h1>{html.escape(_title(runs))}</h1>", f"<p>{many} Made by pmt report.</p>"]
+def _heading(title: str, logs: Sequence[RunLog]) -> list[str]:
+    seeds = sum(len(log.seeds) for log in logs)
+    many = f"{len(logs)} run{'s' * (len(logs) != 1)}, {seeds} seed{'s' * (seeds != 1)} in all."
+    return [f"<h1>{html.escape(title)}</h1>", f"<p>{many} Made by pmt report.</p>"]
 
 
-def _summary(run: plot.Curves) -> str:
-    seeds = ", ".join(map(str, run.seeds))
-    took = f" in {run.seconds:,.0f} s" if math.isfinite(run.seconds) else ""
-    return (
-        f"{run.method} on {run.task}, seeds {seeds}; {int(run.steps[-1]):,} environment steps a seed{took}; "
-        f"limit on an episode's cost {run.cost_limit:g}."
-    )
+# ---------------------------------------------------------------------------------------------------------------------
+# Curves
 
 
-def _curve_sections(runs: Sequence[plot.Curves]) -> list[str]:
+def _curve_sections(shown: Sequence[Group]) -> list[str]:
     body = []
-    for task in dict.fromkeys(run.task for run in runs):
-        chosen = [run for run in runs if run.task == task]
-        for title, wanted in (("Training", plot.PANELS), ("Emotions", plot.EMOTIONS)):
-            panels = plot.panels(chosen, wanted)
-            if not panels:
+    for task in dict.fromkeys(group.task for group in shown):
+        chosen = [group for group in shown if group.task == task]
+        for title, wanted in (("Training", plot.titles(chosen)), ("Emotions", plot.EMOTIONS)):
+            names = plot.panels(chosen, wanted)
+            if not names:
                 continue
-            swatches = (
-                f'<span style="color:{plot.COLOURS[i % len(plot.COLOURS)]}">&#9632;</span> {html.escape(label)}'
-                for i, label in enumerate(plot.labels(chosen))
-            )
             figures = (
-                f'<figure aria-label="{html.escape(name)}">{plot.inline(chosen, name)}</figure>' for name in panels
+                f'<figure aria-label="{html.escape(name)}">{plot.inline(chosen, name, wanted[name])}</figure>'
+                for name in names
             )
             body.append(f"<h2>{title} on {html.escape(task)}</h2>")
-            body.append(f"<p>{' &nbsp; '.join(swatches)}. Lines are means over seeds, bands reach from the lowest to")
-            body.append(f'the highest.</p>\n<div class="curves">{"".join(figures)}</div>')
+            body.append(f'<ul class="legend">{"".join(map(_key, chosen, plot.looks(chosen)))}</ul>')
+            body.append(f"<p>Curves: {html.escape(plot.caption(chosen))}.</p>")
+            body.append(f'<div class="curves">{"".join(figures)}</div>')
     return body
+
+
+def _key(group: Group, look: plot.Look) -> str:
+    """An entry of the legend: a line as in the panels, and a name."""
+    dashes = " ".join(f"{2.5 * float(length):g}" for length in look.dashes.split())
+    line = f'<path d="M0 6H28" stroke="{look.colour}" stroke-width="3" stroke-dasharray="{dashes}"/>'
+    swatch = f'<svg width="28" height="12" aria-hidden="true">{line}</svg>'
+    return f"<li>{swatch}<span>{html.escape(plot.label(group))}</span></li>"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One run
+
+
+def _run_section(log: RunLog, episodes: int) -> list[str]:
+    return [
+        f"<section>\n<h2>{html.escape(log.folder.name)}</h2>",
+        f"<p>{html.escape(_summary(log))}</p>",
+        *_or_reason(lambda: _evaluation(log.folder, episodes)),
+        *_or_reason(lambda: _replay(log.folder)),
+        *_details("Settings", log.settings),
+        *_details("Versions", log.versions),
+        "</section>",
+    ]
+
+
+def _summary(log: RunLog) -> str:
+    seeds = ", ".join(map(str, log.seeds))
+    seconds = log.metrics.get("seconds", [[math.nan]])[0][-1]
+    took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
+    return (
+        f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "
+        f"limit on an episode's cost {log.cost_limit:g}."
+    )
 
 
 def _or_reason(make: Callable[[], list[str]]) -> list[str]:
@@ -108,9 +123,6 @@ def _or_reason(make: Callable[[], list[str]]) -> list[str]:
 
 
 def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
-    from ..policies import evaluate
-    from . import page
-
     kinds = {"sampled": False, "mean": True}
     found = {kind: evaluate.evaluate_run(folder, episodes, mean) for kind, mean in kinds.items()}
     rows = [(kind, row) for kind in kinds for row in found[kind]]
@@ -126,33 +138,24 @@ def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
         f"<h3>Evaluation</h3><p>{episodes} whole episodes a seed from fixed starts, actions sampled or the mean; "
         "mean and half-width of its 95 % interval.</p>",
         table(main),
-        f"<details><summary>All figures of the task</summary>{table(others)}</details>" if others else "",
+        f"<details><summary>All metrics of the task</summary>{table(others)}</details>" if others else "",
     ]
 
 
-def _with_interval(figure: tuple[float, float]) -> str:
-    """A figure and the half-width of its interval, with the digits that the interval leaves a meaning."""
-    mean, half = figure
+def _with_interval(metric: tuple[float, float]) -> str:
+    """A metric and the half-width of its interval, with the digits that the interval leaves a meaning."""
+    mean, half = metric
+    if not math.isfinite(half):
+        return f"{mean:,.4f} ± -"
     digits = 4 if not half > 0 else min(6, max(0, 1 - math.floor(math.log10(half))))
     return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
 
 
 def _replay(folder: pathlib.Path) -> list[str]:
-    from . import episode, page
-
     return ["<h3>An episode</h3>", page.replay(episode.record_run(folder), play=False)]
 
 
-def _versions(folder: pathlib.Path) -> dict[str, Any]:
-    try:
-        return json.loads((folder / "versions.json").read_text())
-    except (OSError, json.JSONDecodeError):
-        return {}
-
-
 def _details(title: str, values: dict[str, Any]) -> list[str]:
-    from . import page
-
     if not values:
         return []
     rows = page.table([], [(name, str(value)) for name, value in values.items()])

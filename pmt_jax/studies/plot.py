@@ -1,28 +1,31 @@
-"""`pmt plot`: training curves of runs, pooled over runs that differ in nothing but their seeds."""
+"""`pmt plot`: training curves, pooled over runs that differ in nothing but their seeds."""
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
 import pathlib
-import tomllib
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..config.settings import Config
-from ..errors import UsageError, optional
-from ..files import read_rows, writing
-from .table import SAME_IN_A_ROW, plain
+from ..config.methods import METHODS
+from ..errors import UsageError
+from ..files import writing
+from ..tasks import columns
+from .rows import same
+from .run_log import Group, RunLog, Say, groups, read_all
 
 POINTS = 100  # of a curve
-PANELS = {
+TRAINING = {
     "episode_reward": "reward of an episode",
     "episode_cost": "cost of an episode (dashed: limit)",
     "violation_rate": "share of steps with a cost",
     "lambda": "multiplier",
+    "true_episode_cost": "true cost of an episode (dashed: limit)",
+    "true_violation_rate": "share of steps with a true cost",
+    "true_step_cost": "true cost of a step",
 }
 EMOTIONS = {
     "fear/brier": "fear: Brier score (0 is perfect)",
@@ -34,132 +37,108 @@ EMOTIONS = {
     "regret/weight_mean": "regret: mean weight of a ratio",
     "regret/weight_std": "regret: spread of the weights",
 }
-COLOURS = ("#2f7fb5", "#e0861a", "#2f9e77", "#c8503f", "#8d6bb8", "#9a7b4f", "#d264a8", "#7f8a91")
-SEEDS_AND_LENGTH = (*SAME_IN_A_ROW, "steps", "num_updates")  # settings in which repetitions of a run may differ
-IDENTITY = {"step", "seed", "task", "method", "cost_limit"}  # what every row of a run says of itself
+COSTS = ("episode_cost", "true_episode_cost")
+
+# Okabe and Ito's colours, which the colour-blind tell apart, on white and on black; one for each method, everywhere.
+GREY, SKY, PURPLE, BLUE, RED, GREEN, ORANGE = (
+    "#7f7f7f",
+    "#56b4e9",
+    "#cc79a7",
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#e69f00",
+)
+METHOD_COLOURS = dict(zip(METHODS, (GREY, SKY, PURPLE, BLUE, RED, GREEN, ORANGE), strict=True))
+OTHER_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, GREY)  # of settings of one method, of methods not in METHODS
+DASHES = ("", "6 2", "1.5 2", "6 2 1.5 2")  # in line widths, as SVG has them
+MOST_BANDS = 3  # curves in a panel; more are lines, with the spread over seeds beside them
 ENDINGS = (".png", ".svg", ".pdf")
 INK = "#808182"  # stands for the reader's own text colour in pictures inside pages
 
 
-@dataclasses.dataclass(frozen=True)
-class Curves:
-    """The figures of one run, or of several that differ in nothing but seeds.
+class Look(NamedTuple):
+    """How a curve is drawn: its colour, and its dashes in line widths (none for a solid line)."""
 
-    Attributes:
-      names: of the run folders.
-      task, method, cost_limit: what was trained, and the limit on an episode's cost.
-      settings: {setting: value}, the options of the task as env.NAME.
-      seeds: [S].
-      steps: [P] environment steps of one seed.
-      figures: {name: [S, P]}, nan where unknown.
-      seconds: the longest wall time, s.
-    """
-
-    names: tuple[str, ...]
-    task: str
-    method: str
-    cost_limit: float
-    settings: dict[str, Any]
-    seeds: tuple[int, ...]
-    steps: np.ndarray
-    figures: dict[str, np.ndarray]
-    seconds: float
+    colour: str
+    dashes: str = ""
 
 
-def read(folder: pathlib.Path, names: Iterable[str] = (*PANELS, *EMOTIONS)) -> Curves:
-    """The figures `names` of a run folder, as far as it has them, averaged into at most POINTS points.
+def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = None) -> None:
+    """Draws the curves of run folders into `out` (.png, .svg or .pdf): a row of panels a task, a colour a method.
 
-    Lines cut off in the middle are left out; where a step stands twice, the later line counts.
+    Args:
+      note: told of folders that are left out.
 
     Raises:
-      UsageError: the folder has no metrics.jsonl, or nothing in it yet.
+      UsageError: a folder that cannot be read, no run at all, another ending, or `out` that cannot be written.
     """
-    rows = _rows(folder)
-    if not rows:
-        raise UsageError(f"{folder} has no figures yet: its metrics.jsonl is empty; wait for the first chunk")
-    last = rows[max(rows)]
-    steps = np.array(sorted({step for step, _ in rows}))
-    seeds = tuple(sorted({seed for _, seed in rows}))
-    groups = np.array_split(np.arange(len(steps)), min(POINTS, len(steps)))
-    table = [[rows.get((step, seed), {}) for step in steps.tolist()] for seed in seeds]
-    figures = {}
-    for name in names:
-        if any(name in row for row in rows.values()):
-            values = np.array([[_number(row.get(name)) for row in one] for one in table])
-            figures[name] = _averaged(values, groups)
-    return Curves(
-        names=(folder.name,),
-        task=last["task"],
-        method=last["method"],
-        cost_limit=last["cost_limit"],
-        settings=_settings(folder),
-        seeds=seeds,
-        steps=np.array([steps[group[-1]] for group in groups]),
-        figures=figures,
-        seconds=max(_number(row.get("seconds")) for row in rows.values()),
-    )
+    if out.suffix not in ENDINGS:
+        raise UsageError(f"cannot write {out}: its ending must be .png, .svg or .pdf")
+    draw(pooled(read_all(folders, note), note), out)
 
 
-def _rows(folder: pathlib.Path) -> dict[tuple[int, int], dict[str, Any]]:
-    """{(step, seed): row} of a metrics.jsonl."""
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is not a run folder: there is no such folder")
-    try:
-        rows = read_rows(folder / "metrics.jsonl", missing_ok=False)
-    except OSError as error:
-        raise UsageError(
-            f"{folder} has no figures to draw: cannot read its metrics.jsonl ({error.strerror})"
-        ) from error
-    return {(row["step"], row["seed"]): row for row in rows if IDENTITY <= row.keys()}
+def pooled(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
+    """Runs that are the same up to seeds, their curves averaged into at most POINTS points."""
+    return groups([log.thinned(POINTS) for log in logs], note or print)
 
 
-def _number(x: Any) -> float:
-    return float(x) if isinstance(x, int | float) else math.nan
+def looks(shown: Sequence[Group]) -> list[Look]:
+    """A method has its colour and its settings have dashes; where there is but one method, settings have colours."""
+    methods = list(dict.fromkeys(group.method for group in shown))
+    result, seen = [], dict.fromkeys(methods, 0)
+    for number, group in enumerate(shown):
+        place = number if len(methods) == 1 and len(shown) > 1 else seen[group.method]
+        if len(methods) == 1 and len(shown) > 1:
+            result.append(Look(OTHER_COLOURS[place % len(OTHER_COLOURS)], DASHES[place // len(OTHER_COLOURS) % 4]))
+        else:
+            other = OTHER_COLOURS[methods.index(group.method) % len(OTHER_COLOURS)]
+            result.append(Look(METHOD_COLOURS.get(group.method, other), DASHES[place % len(DASHES)]))
+        seen[group.method] += 1
+    return result
 
 
-def _averaged(values: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
-    """[S, groups] means over what is known in each group of columns of `values` [S, R]."""
-    known = np.isfinite(values)
-    starts = [group[0] for group in groups]
-    count = np.add.reduceat(known, starts, axis=1, dtype=int)
-    total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def label(group: Group) -> str:
+    """A curve's name in a legend."""
+    count = len(group.seeds)
+    return f"{group.label} ({count} seed{'s' * (count != 1)})"
 
 
-def _settings(folder: pathlib.Path) -> dict[str, Any]:
-    try:
-        settings = tomllib.loads((folder / "config.toml").read_text())
-    except (OSError, tomllib.TOMLDecodeError):
-        return {}
-    options = settings.pop("env", {})
-    return settings | {f"env.{name}": value for name, value in options.items()}
+def caption(shown: Sequence[Group]) -> str:
+    """What lines and bands mean."""
+    if all(len(group.seeds) == 1 for group in shown):
+        return "one seed a line"
+    if len(shown) <= MOST_BANDS:
+        return "mean of the seeds, band from the lowest to the highest"
+    return "mean of the seeds; bars on the right reach from the lowest to the highest seed at the end"
 
 
-def pool(runs: Sequence[Curves]) -> list[Curves]:
-    """Joins runs that differ in nothing but their seeds and length; shorter ones are nan beyond their end."""
-    alike: dict[str, list[Curves]] = {}
-    for run in runs:
-        varied = {name: x for name, x in run.settings.items() if name not in SEEDS_AND_LENGTH}
-        alike.setdefault(repr((run.task, run.method, run.cost_limit, varied or run.names)), []).append(run)
-    return [_joined(group) for group in alike.values()]
+def panels(shown: Sequence[Group], wanted: dict[str, str]) -> list[str]:
+    """The metrics among `wanted` that any run knows; true costs only where a run did not feel all of them."""
+
+    def known(name: str) -> bool:
+        return any(np.isfinite(run.metrics.get(name, np.nan)).any() for group in shown for run in group.runs)
+
+    runs = [run for group in shown for run in group.runs]
+    felt = all(same(run.metrics.get("true_violation_rate"), run.metrics.get("violation_rate")) for run in runs)
+    return [name for name in wanted if known(name) and not (felt and name.startswith("true_"))]
 
 
-def _joined(runs: list[Curves]) -> Curves:
-    steps = max((run.steps for run in runs), key=lambda steps: steps[-1])
-    names = sorted({name for run in runs for name in run.figures})
-    return dataclasses.replace(
-        runs[0],
-        names=tuple(name for run in runs for name in run.names),
-        seeds=tuple(seed for run in runs for seed in run.seeds),
-        steps=steps,
-        figures={name: np.concatenate([_at_steps(run, name, steps) for run in runs]) for name in names},
-        seconds=max(run.seconds for run in runs),
-    )
+def titles(shown: Sequence[Group]) -> dict[str, str]:
+    """What can be drawn of training, by metric: what all tasks have, and what these declare."""
+    declared = {name: c for task in {g.task for g in shown} for name, c in columns(task).items()}
+    return TRAINING | {f"info/{name}": f"{c.name}: {c.definition.split(';')[0]}" for name, c in declared.items()}
 
 
-def _at_steps(run: Curves, name: str, steps: np.ndarray) -> np.ndarray:
-    """[S, P] a figure at other steps, straight lines between what is known; nan outside of it."""
-    values = run.figures.get(name, np.full((len(run.seeds), len(run.steps)), np.nan))
+def curve(group: Group, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """The steps [P] of a group's longest run and a metric [S, P] there, straight lines between what is known."""
+    steps = max((run.steps for run in group.runs), key=lambda steps: steps[-1])
+    return steps, np.concatenate([_at_steps(run, name, steps) for run in group.runs])
+
+
+def _at_steps(run: RunLog, name: str, steps: np.ndarray) -> np.ndarray:
+    """[S, P] a run's metric at other steps; nan outside of what is known."""
+    values = run.metrics.get(name, np.full((len(run.seeds), len(run.steps)), np.nan))
     if np.array_equal(run.steps, steps):
         return values
     result = np.full((len(values), len(steps)), np.nan)
@@ -170,109 +149,130 @@ def _at_steps(run: Curves, name: str, steps: np.ndarray) -> np.ndarray:
     return result
 
 
-def labels(runs: Sequence[Curves]) -> list[str]:
-    """What tells each run from the others of its task: the method, and settings that others of it have otherwise."""
-
-    def value(run: Curves, name: str) -> str:  # a run of before a setting came to be has its default
-        return plain(run.settings.get(name, getattr(Config, name, "default")))
-
-    result = []
-    for run in runs:
-        alike = [other for other in runs if (other.task, other.method) == (run.task, run.method)]
-        names = {name for other in alike for name in other.settings} - set(SEEDS_AND_LENGTH)
-        varied = [name for name in sorted(names) if len({value(other, name) for other in alike}) > 1]
-        words = [f"{name} = {value(run, name)}" for name in varied]
-        if len(alike) > 1 and not words:
-            words = [", ".join(run.names)]
-        result.append(", ".join([run.method, *words]))
-    return result
+# ---------------------------------------------------------------------------------------------------------------------
+# Drawing
 
 
-def plot(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
-    """Draws the curves of run folders into `out` (.png, .svg or .pdf): a row of panels a task, a colour a method.
-
-    Raises:
-      UsageError: a folder without figures, another ending, matplotlib missing, or `out` that cannot be written.
-    """
-    if out.suffix not in ENDINGS:
-        raise UsageError(f"cannot write {out}: its ending must be .png, .svg or .pdf")
-    optional("matplotlib", "render")
-    draw(pool([read(folder) for folder in folders]), out)
-
-
-def draw(runs: Sequence[Curves], out: pathlib.Path) -> None:
-    """Like `plot`, of runs already read."""
+def draw(shown: Sequence[Group], out: pathlib.Path) -> None:
+    """Like `plot`, of runs already pooled."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    tasks = list(dict.fromkeys(run.task for run in runs))
-    names = panels(runs, PANELS | EMOTIONS)
-    columns = min(4, len(names))
-    deep = -(-len(names) // columns)
-    named = [labels([run for run in runs if run.task == task]) for task in tasks]
-    entry = 1 + 0.065 * max(len(label) for task in named for label in task)  # inches, at the legend's size of letters
-    wide = max(3.1 * columns, entry)
-    legend_columns = min(4, int(wide / entry))
-    high = 2.5 * deep + 0.16 * (max(map(len, named)) // legend_columns)
+    tasks = {task: [g for g in shown if g.task == task] for task in dict.fromkeys(g.task for g in shown)}
+    sizes = [_size(groups) for groups in tasks.values()]
+    wide = max(width for width, _ in sizes)
     with rc_context({"font.size": 9, "svg.fonttype": "none"}), writing(out) as partial:
-        figure = Figure(figsize=(wide, high * len(tasks) + 0.4), layout="constrained")
-        rows = figure.subfigures(len(tasks), 1, squeeze=False)[:, 0]
-        for row, task in zip(rows, tasks, strict=True):
-            chosen = [run for run in runs if run.task == task]
-            axes = row.subplots(deep, columns, squeeze=False).ravel()
-            for axis, name in zip(axes, names, strict=False):
-                _panel(axis, chosen, name)
-            for axis in axes[len(names) :]:
-                axis.set_axis_off()
-            row.suptitle(f"{task}: mean of the seeds, band from lowest to highest", fontsize=9)
-            handles = axes[0].get_legend_handles_labels()
-            row.legend(*handles, loc="outside lower center", ncols=legend_columns, frameon=False, fontsize=8)
+        figure = Figure(figsize=(wide, sum(height for _, height in sizes)), layout="constrained")
+        parts = figure.subfigures(len(tasks), 1, squeeze=False, height_ratios=[height for _, height in sizes])[:, 0]
+        for part, (task, groups) in zip(parts, tasks.items(), strict=True):
+            _task_panels(part, task, groups, wide)
         figure.savefig(partial, dpi=110, format=out.suffix[1:])
 
 
-def panels(runs: Sequence[Curves], wanted: dict[str, str]) -> list[str]:
-    """The figures that any run knows; the cost's also where no episode has ended yet."""
-    return [name for name in wanted if any(np.isfinite(run.figures.get(name, np.nan)).any() for run in runs)]
+def _size(shown: Sequence[Group]) -> tuple[float, float]:
+    """Width and height in inches of a task's panels and legend."""
+    count = len(panels(shown, titles(shown) | EMOTIONS))
+    entry = _entry(shown)
+    wide = max(3.1 * min(4, count), entry)
+    return wide, 2.5 * -(-count // 4) + 0.4 + 0.16 * (len(shown) - 1) // min(4, int(wide / entry))
 
 
-def _panel(axis: Any, runs: Sequence[Curves], name: str) -> None:
-    """One figure of runs of one task over environment steps."""
+def _entry(shown: Sequence[Group]) -> float:
+    """Width of the longest name in the legend, inches."""
+    return 1 + 0.065 * max(len(label(group)) for group in shown)
+
+
+def _task_panels(part: Any, task: str, shown: Sequence[Group], wide: float) -> None:
+    wanted = titles(shown) | EMOTIONS
+    names = panels(shown, wanted)
+    across = min(4, len(names))
+    axes = part.subplots(-(-len(names) // across), across, squeeze=False).ravel()
+    for axis, name in zip(axes, names, strict=False):
+        _panel(axis, shown, name, wanted[name])
+    for axis in axes[len(names) :]:
+        axis.set_axis_off()
+    part.suptitle(f"{task}: {caption(shown)}", fontsize=9)
+    handles = axes[0].get_legend_handles_labels()
+    beside = max(1, min(4, int(wide / _entry(shown))))
+    part.legend(*handles, loc="outside lower center", ncols=beside, frameon=False, fontsize=8)
+
+
+def _panel(axis: Any, shown: Sequence[Group], name: str, title: str) -> None:
+    """One metric of runs of one task over environment steps."""
     from matplotlib.ticker import EngFormatter
 
-    for i, (run, label) in enumerate(zip(runs, labels(runs), strict=True)):
-        values = run.figures.get(name, np.full((1, len(run.steps)), np.nan))
+    end = max(int(run.steps[-1]) for group in shown for run in group.runs)
+    banded = len(shown) <= MOST_BANDS
+    for number, (group, look) in enumerate(zip(shown, looks(shown), strict=True)):
+        steps, values = curve(group, name)
         known = np.isfinite(values).any(0)
         low, mid, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))
-        look = {"color": COLOURS[i % len(COLOURS)], "ls": ("-", "--", ":", "-.")[i // len(COLOURS) % 4]}
-        seeds = f"{len(run.seeds)} seed{'s' * (len(run.seeds) != 1)}"
-        axis.plot(run.steps[known], mid, lw=1.4, label=f"{label} ({seeds})", **look)
-        if len(values) > 1:
-            axis.fill_between(run.steps[known], low, high, alpha=0.18, color=look["color"], lw=0)
-    if name == "episode_cost":
-        limit = runs[0].cost_limit
-        axis.axhline(limit, color=INK, ls="--", lw=1)
-        axis.set_yscale("symlog", linthresh=max(limit, 1.0))
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.set_ylim(bottom=0)
-    axis.set_title((PANELS | EMOTIONS)[name], fontsize=9)
+        style = (0, tuple(map(float, look.dashes.split()))) if look.dashes else "-"
+        axis.plot(steps[known], mid, lw=1.5, label=label(group), color=look.colour, ls=style)
+        if len(values) > 1 and banded:
+            axis.fill_between(steps[known], low, high, alpha=0.18, color=look.colour, lw=0)
+        elif len(values) > 1:
+            _spread(axis, end * (1.04 + 0.025 * number), values, look.colour)
+    if name in COSTS:
+        _cost_axis(axis, shown, name)
+    axis.set_title(title, fontsize=9)
     axis.set_xlabel("environment steps of a seed", fontsize=8)
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= 1.01 * end])
     axis.grid(alpha=0.25, lw=0.6)
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def inline(runs: Sequence[Curves], name: str) -> str:
+def _spread(axis: Any, x: float, values: np.ndarray, colour: str) -> None:
+    """The seeds' means over the last tenth of a curve: a bar from the lowest to the highest, a dot at the mean."""
+    last = values[:, -max(1, values.shape[1] // 10) :]
+    seeds = np.array([row[np.isfinite(row)].mean() for row in last if np.isfinite(row).any()])
+    if seeds.size:
+        axis.plot([x, x], [seeds.min(), seeds.max()], color=colour, lw=2.2, solid_capstyle="butt")
+        axis.plot([x], [seeds.mean()], color=colour, marker="o", ms=3.5, ls="")
+
+
+def _cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
+    """The limit as a dashed line; linear up to it, logarithmic beyond where costs are many times as high."""
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    limits = sorted({group.true_limit if name.startswith("true") else group.cost_limit for group in shown})
+    for limit in limits:
+        axis.axhline(limit, color=INK, ls="--", lw=1)
+    top = max(np.nanmax(curve(group, name)[1], initial=0.0) for group in shown)
+    bend = max(limits) or 1.0
+    if top > 4 * bend:
+        ticks = cost_ticks(bend, top)
+        axis.set_yscale("symlog", linthresh=bend)
+        axis.yaxis.set_major_locator(FixedLocator(ticks))
+        axis.yaxis.set_minor_locator(NullLocator())
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_ylabel("linear up to the limit, then logarithmic", fontsize=7)
+        axis.set_ylim(top=max(top, ticks[-1]) * 1.1)
+    axis.set_ylim(bottom=0)
+
+
+def cost_ticks(bend: float, top: float) -> list[float]:
+    """Ticks of an axis that is linear up to `bend`, then logarithmic up to `top`: 0, half, bend, 1, 2, 5, 10 ..."""
+    first, last = math.floor(math.log10(bend)), math.ceil(math.log10(top))
+    steps = [digit * 10.0**power for power in range(first, last + 1) for digit in (1, 2, 5)]
+    beyond = [tick for tick in steps if 1.5 * bend < tick <= 1.2 * top]
+    sparse = beyond if len(beyond) <= 5 else [tick for tick in beyond if f"{tick:e}".startswith("1")]
+    return [0, bend / 2, bend, *sparse]
+
+
+def inline(shown: Sequence[Group], name: str, title: str) -> str:
     """A panel as SVG for a page, in the reader's own text colour."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
-    style: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": f"{runs[0].task} {name}", "font.size": 10}
+    style: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": f"{shown[0].task} {name}", "font.size": 10}
     with rc_context(dict.fromkeys(inks, INK) | style):
         figure = Figure(figsize=(3.6, 2.5), layout="constrained", facecolor="none")
         axis = figure.subplots()
         axis.set_facecolor("none")
-        _panel(axis, runs, name)
+        _panel(axis, shown, name, title)
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
     svg = text.getvalue()

@@ -1,100 +1,134 @@
-"""Figures over few runs that one lucky seed cannot carry (Agarwal et al., 2021, arXiv 2108.13264), in plain NumPy.
+"""Scores of few seeds: averages, intervals that are calibrated at five seeds, and tests of one method against another.
 
-Scores come as strata: one sequence of runs per task, each run one number. A resample draws runs with replacement
-within every task, so that no task drops out of a resample.
+Averages are the mean and the interquartile mean, which one lucky seed cannot carry (Agarwal et al., 2021, arXiv
+2108.13264). The percentile bootstrap's 95 % interval covers 81 to 91 % at five seeds, so intervals are Student's here.
+Scores come as one number per seed.
 
 Example:
-  >>> float(iqm([1.0, 2.0, 3.0, 100.0]))
+  >>> iqm([1.0, 2.0, 3.0, 100.0])
   2.5
   >>> probability_of_improvement([[2.0, 3.0]], [[1.0, 2.0]])
   0.875
+  >>> holm([0.01, 0.04])
+  [0.02, 0.04]
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import functools
+import math
+from collections.abc import Sequence
 
 import numpy as np
+import scipy.optimize
+import scipy.special
+import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
-RESAMPLES = 10_000
 LEVEL = 0.95
+DRAWS = 100_000  # of normal samples, for the IQM's quantile
 
-Strata = Sequence[ArrayLike]  # one [runs] per task; tasks may have different numbers of runs
-Statistic = Callable[..., NDArray[np.float64]]  # (scores [..., n], axis=-1) -> [...]; np.mean is one
+Interval = tuple[float, float]  # (low, high), nan where one score says nothing of the spread
+Strata = Sequence[ArrayLike]  # one [seeds] per task; tasks may have different numbers of seeds
 
 
-def iqm(scores: ArrayLike, axis: int | None = None) -> Any:
-    """Interquartile mean, in the scores' unit: robust as the median, efficient as the mean.
+def iqm(scores: ArrayLike) -> float:
+    """Interquartile mean: without the lowest and the highest quarter (rounded down: one of five, none of three)."""
+    return float(scipy.stats.trim_mean(np.ravel(scores), 0.25))
 
-    The lowest and the highest quarter of the scores (rounded down: none of three, one of five) are cut off.
 
-    Args:
-      scores: [...]; axis: along which, or None for all scores together.
+def mean_interval(scores: ArrayLike, level: float = LEVEL) -> Interval:
+    """Student's interval of the mean of scores [seeds]."""
+    scores = np.asarray(scores, float)
+    if scores.size < 2:
+        return math.nan, math.nan
+    half = scipy.special.stdtrit(scores.size - 1, (1 + level) / 2) * scores.std(ddof=1) / scores.size**0.5
+    return float(scores.mean() - half), float(scores.mean() + half)
 
-    Returns:
-      [...] without `axis`; a scalar for None.
+
+def iqm_interval(scores: ArrayLike, level: float = LEVEL) -> Interval:
+    """The studentised interval of the interquartile mean of scores [seeds].
+
+    It is the IQM +- q s. s is the standard deviation after the outer eighth at either end (rounded down) was moved to
+    the nearest score that is left; q is the quantile of |IQM| / s of normal scores, so that the interval is exact for
+    normal seeds. Below four seeds the IQM is the mean, and this is Student's interval.
     """
-    ordered = np.sort(np.asarray(scores, float), axis)
-    ordered = ordered if axis is None else np.moveaxis(ordered, axis, -1)
-    cut = ordered.shape[-1] // 4
-    return ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
+    scores = np.asarray(scores, float)
+    if scores.size < 4:
+        return mean_interval(scores, level)
+    middle, half = iqm(scores), _normal_quantile(scores.size, level) * float(_spread(scores))
+    return middle - half, middle + half
 
 
-def bootstrap_interval(
-    strata: Strata, statistic: Statistic = iqm, level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[float, float]:
-    """The stratified bootstrap's percentile interval of `statistic` over all scores together.
+@functools.cache
+def _normal_quantile(count: int, level: float) -> float:
+    """The `level` quantile of |IQM| / spread of `count` standard normal scores."""
+    normal = np.random.default_rng(count).standard_normal((DRAWS, count))
+    return float(np.quantile(np.abs(scipy.stats.trim_mean(normal, 0.25, axis=1)) / _spread(normal), level))
 
-    Args:
-      strata: scores [runs] of every task, in one unit (normalise them first if tasks differ in theirs).
-      statistic: (scores [resamples, n], axis=-1) -> [resamples].
-      level: the share of resamples that the interval covers.
-      seed: the same scores give the same interval.
 
-    Returns:
-      (low, high), in the scores' unit; both the score itself where there is but one.
-    """
-    rng = np.random.default_rng(seed)
-    drawn = np.concatenate([_resample(rng, scores, resamples) for scores in strata], axis=-1)
-    return _percentiles(statistic(drawn, axis=-1), level)
+def _spread(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[...] standard deviation of scores [..., seeds] whose outer eighths were moved inwards."""
+    ordered, cut = np.sort(scores), scores.shape[-1] // 8
+    low, high = ordered[..., cut, None], ordered[..., -1 - cut, None]
+    return np.clip(ordered, low, high).std(-1, ddof=1)
 
 
 def probability_of_improvement(ours: Strata, theirs: Strata) -> float:
-    """How likely a run of ours scores higher than a run of theirs on a task drawn at random; ties count half.
+    """How likely a seed of ours scores higher than a seed of theirs on a task drawn at random; ties count half.
 
-    The mean over tasks of U / (runs of ours * runs of theirs), with Mann and Whitney's U.
+    The mean over tasks of U / (seeds of ours * seeds of theirs), with Mann and Whitney's U. It is an effect size: 0.5
+    means no difference, 0 and 1 complete separation.
 
     Args:
-      ours, theirs: scores [runs] of the same tasks in the same order; their units may differ from task to task.
+      ours, theirs: scores [seeds] of the same tasks in the same order; their units may differ from task to task.
     """
-    pairs = zip(ours, theirs, strict=True)
-    return float(np.mean([_share_of_wins(np.asarray(x, float), np.asarray(y, float)) for x, y in pairs]))
+    return float(np.mean([_share_of_wins(x, y) for x, y in zip(ours, theirs, strict=True)]))
 
 
-def improvement_interval(
-    ours: Strata, theirs: Strata, level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[float, float]:
-    """The stratified bootstrap's percentile interval of `probability_of_improvement`; both sides are resampled."""
-    rng = np.random.default_rng(seed)
-    pairs = zip(ours, theirs, strict=True)
-    wins = [_share_of_wins(_resample(rng, x, resamples), _resample(rng, y, resamples)) for x, y in pairs]
-    return _percentiles(np.mean(wins, axis=0), level)
+def improvement_interval(ours: Strata, theirs: Strata, level: float = LEVEL) -> Interval:
+    """The interval of `probability_of_improvement`.
+
+    Newcombe's fifth method (2006, Statistics in Medicine 25) for each task, combined over tasks by the distances from
+    the estimate to the limits. It has a width at complete separation, too.
+    """
+    found = [(_share_of_wins(x, y), *_newcombe(x, y, level)) for x, y in zip(ours, theirs, strict=True)]
+    middle, low, high = np.array(found).T
+    return (
+        float(middle.mean() - np.hypot.reduce(middle - low) / len(found)),
+        float(middle.mean() + np.hypot.reduce(high - middle) / len(found)),
+    )
 
 
-def _resample(rng: np.random.Generator, scores: ArrayLike, resamples: int) -> NDArray[np.float64]:
-    """[resamples, runs] drawn with replacement from scores [runs]."""
-    scores = np.asarray(scores, float)
-    return rng.choice(scores, (resamples, scores.size))
+def _share_of_wins(x: ArrayLike, y: ArrayLike) -> float:
+    """The share of pairs of x [n] and y [m] with x > y; ties count half."""
+    return float(scipy.stats.mannwhitneyu(x, y, method="asymptotic").statistic / (np.size(x) * np.size(y)))
 
 
-def _share_of_wins(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[...] the share of pairs from x [..., n] and y [..., m] with x > y; ties count half."""
-    x, y = x[..., :, None], y[..., None, :]
-    return ((x > y) + 0.5 * (x == y)).mean((-2, -1))
+def _newcombe(x: ArrayLike, y: ArrayLike, level: float) -> Interval:
+    """Where the share of wins lies `level` of the time, for scores x [n] and y [m] of one task."""
+    share, n, m = _share_of_wins(x, y), np.size(x), np.size(y)
+    z, other_pairs = scipy.special.ndtri((1 + level) / 2), (n + m) / 2 - 1
 
+    def beyond(p: float) -> float:
+        variance = p * (1 - p) / (n * m) * (1 + other_pairs * ((1 - p) / (2 - p) + p / (1 + p)))
+        return (share - p) ** 2 - z**2 * variance
 
-def _percentiles(values: NDArray[np.float64], level: float) -> tuple[float, float]:
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
+    inside = min(max(share, 1e-9), 1 - 1e-9)  # 0 and 1 are roots themselves where all pairs agree
+    low = scipy.optimize.brentq(beyond, 0, inside) if share > 0 else 0.0
+    high = scipy.optimize.brentq(beyond, inside, 1) if share < 1 else 1.0
     return float(low), float(high)
+
+
+def u_test(ours: ArrayLike, theirs: ArrayLike) -> float:
+    """The two-sided p of Mann and Whitney's U test, exact for up to eight seeds a side without ties."""
+    return float(scipy.stats.mannwhitneyu(ours, theirs).pvalue)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """p values corrected for their number by Holm's step-down method, in the order given."""
+    order = np.argsort(p_values)
+    steps = np.asarray(p_values, float)[order] * np.arange(len(order), 0, -1)
+    corrected = np.empty(len(order))
+    corrected[order] = np.minimum(1, np.maximum.accumulate(steps))
+    return corrected.tolist()

@@ -7,29 +7,26 @@ A finished point is a run folder like any other. Points of one program train tog
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import pathlib
-import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from ..config.methods import METHODS
 from ..config.settings import HYPER_FIELDS, Config, differences, load_config, to_toml
 from ..errors import UsageError
-from ..files import read_rows
+from ..files import read_rows, writing
 from ..learning.setup import Trials, make_setup
-from ..tasks import did_you_mean, names
 from ..training import trainer
 from ..training.checkpoint import Checkpoints
 from ..training.run_folder import Say, load_saved
 from . import table, workers
-
-Points = dict[str, Config]  # by the name of the point's folder
+from .points import Part, Points, drawn
+from .rows import rows
+from .run_log import read_all
 
 
 class Launch(NamedTuple):
@@ -38,7 +35,7 @@ class Launch(NamedTuple):
     Attributes:
       cache: keep compiled programs on disk.
       say: prints a line.
-      count: of devices, as for `experiment.train`.
+      count: of devices, as for `trainer.train`.
       at_once: programs that train at a time, each in a process of its own where it is more than one.
     """
 
@@ -51,79 +48,24 @@ class Launch(NamedTuple):
 ONE_AT_A_TIME = Launch()
 
 
-def grid(
-    source: str | pathlib.Path, vary: Mapping[str, Sequence[str]], preset: str = "default", **fixed: Any
-) -> Points:
-    """All combinations of the values in `vary`, by name: `fear_l2=0,lambda_lr=0.1`.
+def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
+    """Trains what is missing of the `points` of `parts` (see `train_points`) and says which meet the limit best.
 
-    Args:
-      source, preset, fixed: as for `load_config`.
-      vary: values of fields of Config, `method` included.
-
-    Raises:
-      UsageError: an unknown field, or a value that does not fit.
+    What was drawn at random stands in draws.json.
     """
-    points = {}
-    for values in itertools.product(*vary.values()):
-        chosen: dict[str, Any] = dict(zip(vary, values, strict=True))
-        name = ",".join(f"{k}={_word(v)}" for k, v in chosen.items()) or "point"
-        if "env" in chosen:
-            chosen["env"] = [chosen["env"]]
-        points[name] = load_config(source, preset=preset, **{**fixed, **chosen})
-    return points
-
-
-def _word(value: str) -> str:
-    """A value as it stands in a folder's name: a number the same however it was written."""
-    try:
-        return f"{float(value):.12g}"
-    except ValueError:
-        return re.sub(r"[^\w.=,+-]", "-", value)
-
-
-def sweep(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of `points` (see `train_points`) and says which are best under the cost limit."""
-    code = train_points(points, out, launch)
+    wanted = missing_programs(points, out, launch.say)
+    if values := drawn(parts, points):
+        launch.say(
+            f"drawn with seed {', '.join(str(part.seed) for part in parts if part.ranges)}: {out / 'draws.json'}"
+        )
+        with writing(out / "draws.json") as partial:
+            partial.write_text(json.dumps(values, indent=1) + "\n")
+    code = train_programs(wanted, launch)
     if code == 0:
         launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        launch.say(table.render(sorted(table.rows([out / name for name in points]), key=lambda row: row.rank)))
+        found = rows(read_all([out / name for name in points]))
+        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
     return code
-
-
-def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
-
-    Args:
-      name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
-
-    Raises:
-      UsageError: an unknown table or budget, or a task that cannot run here.
-    """
-    paper = table.paper()
-    for what, word, known in (("table", name, paper["tables"]), ("budget", budget, paper["budgets"])):
-        if word not in known:
-            raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
-    wanted, settings = paper["tables"][name], paper["budgets"][budget]
-    absent = [task for task in wanted["tasks"] if task not in names()]
-    if absent:
-        raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
-    plans = {task: _plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
-    for points in plans.values():
-        make_setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
-    programs = [program for task, points in plans.items() for program in _programs(points, out / task, launch.say)]
-    code = _train(programs, launch)
-    if code:
-        return code
-    rows = table.rows([out / task / point for task, points in plans.items() for point in points])
-    launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
-    launch.say(table.render(rows, form, wanted["baseline"]))
-    return 0
-
-
-def _plan(task: str, methods: Sequence[str], budget: Mapping[str, str]) -> Points:
-    """A budget's settings of a task: its `source` in configs/ for that task, or its `preset` over the task's own."""
-    source = budget.get("source", "{task}").format(task=task)
-    return grid(source, {"method": methods}, budget.get("preset", "default"))
 
 
 def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
@@ -132,16 +74,16 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
     Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
 
     Returns:
-      The exit code of `experiment.train`: 0 when all points are finished.
+      The exit code of `trainer.train`: 0 when all points are finished.
 
     Raises:
       UsageError: `out` holds a point of the same name with other settings.
     """
-    return _train(_programs(points, out, launch.say), launch)
+    return train_programs(missing_programs(points, out, launch.say), launch)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Program:
+class Program:
     """Points that train together: their hidden folder, and the folder that gets theirs."""
 
     folder: pathlib.Path
@@ -154,16 +96,16 @@ class _Program:
         return f"program {number} of {count}: {len(self.points)} point(s) x {seeds} seed(s) side by side"
 
 
-def _programs(points: Points, out: pathlib.Path, say: Say) -> list[_Program]:
+def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Program]:
     """What is missing of `points`."""
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
-    return [_Program(folder, group, out) for folder, group in _groups(points, missing, out)]
+    return [Program(folder, group, out) for folder, group in _groups(points, missing, out)]
 
 
-def _train(programs: Sequence[_Program], launch: Launch) -> int:
-    """Trains programs one after the other, or several at a time in processes of their own."""
+def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) -> int:
+    """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
     cache, say, count, at_once = launch
     for program in programs:
         _write_points(program)
@@ -181,7 +123,7 @@ def _train(programs: Sequence[_Program], launch: Launch) -> int:
     return 0
 
 
-def _write_points(program: _Program) -> None:
+def _write_points(program: Program) -> None:
     try:
         (program.folder / "points").mkdir(parents=True, exist_ok=True)
         for name, config in program.points.items():

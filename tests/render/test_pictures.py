@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from by_hand import row, written
 from envs.base import Declarations, Scene
 from envs.voltage.layout import layout
 from pmt_jax import tasks
 from pmt_jax.errors import UsageError
 from pmt_jax.render import episode, film, grid_map, page, report
-from pmt_jax.studies import plot
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1, "--no-cache")
 
@@ -240,87 +240,6 @@ def test_without_opengl_a_sentence_names_the_way_out(monkeypatch: pytest.MonkeyP
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Curves
-
-
-def written(folder: pathlib.Path, lines: list[str], config: str = 'task = "lane"\n') -> pathlib.Path:
-    folder.mkdir(parents=True)
-    (folder / "config.toml").write_text(config)
-    (folder / "metrics.jsonl").write_text("".join(lines))
-    return folder
-
-
-def row(step: int, seed: int, reward: float | None, **more: object) -> str:
-    figures = {"task": "lane", "method": "mappo_l", "cost_limit": 1.0, "episode_reward": reward, **more}
-    return json.dumps({"step": step, "seed": seed, **figures}) + "\n"
-
-
-def test_figures_are_read_as_they_stand(tmp_path: pathlib.Path):
-    lines = [
-        row(10, 0, None),
-        row(10, 1, 2.0),
-        row(20, 0, 3.0),
-        row(20, 1, 4.0),
-        row(20, 1, 5.0),
-        '{"step": 30, "seed": 0}\n{"step": 30, "se',
-    ]
-    curves = plot.read(written(tmp_path / "a", lines))
-    assert curves.steps.tolist() == [10, 20] and curves.seeds == (0, 1)
-    np.testing.assert_array_equal(curves.figures["episode_reward"], [[np.nan, 3], [2, 5]])
-    many = [row(step, 0, float(step)) for step in range(1, 1001)]
-    curves = plot.read(written(tmp_path / "b", many))
-    assert len(curves.steps) == plot.POINTS and curves.steps[-1] == 1000
-    np.testing.assert_allclose(curves.figures["episode_reward"][0, :2], [5.5, 15.5])
-
-
-def test_runs_that_differ_in_seeds_alone_are_one_curve(tmp_path: pathlib.Path):
-    config = 'task = "lane"\nlambda_lr = {}\nseed = {}\n'
-    runs = []
-    for name, rate, seed, length in (("a", 0.1, 0, 3), ("b", 0.1, 1, 2), ("c", 0.3, 0, 3)):
-        lines = [row(step, seed, 10.0 * step) for step in range(1, length + 1)]
-        runs.append(plot.read(written(tmp_path / name, lines, config.format(rate, seed))))
-    pooled = plot.pool(runs)
-    assert [run.seeds for run in pooled] == [(0, 1), (0,)]
-    np.testing.assert_array_equal(pooled[0].figures["episode_reward"], [[10, 20, 30], [10, 20, np.nan]])
-    assert plot.labels(pooled) == ["mappo_l, lambda_lr = 0.1", "mappo_l, lambda_lr = 0.3"]
-
-
-def test_a_setting_that_a_run_does_not_name_has_its_default(tmp_path: pathlib.Path):
-    config = 'task = "lane"\nlambda_lr = 0.1\n'
-    settings = (config, config + "lr_half_life = inf\n", config + "lr_half_life = 1e6\n")
-    runs = [plot.read(written(tmp_path / f"{i}", [row(10, 0, 1.0)], text)) for i, text in enumerate(settings)]
-    assert plot.labels(runs) == [f"mappo_l, lr_half_life = {x}" for x in ("inf", "inf", "1e+06")]
-
-
-def test_long_names_of_many_runs_stand_below_one_another_and_within_the_picture(tmp_path: pathlib.Path):
-    config = 'task = "lane"\nlr_half_life = {0}\ncritic_lr = {0}\nminibatches = {0}\nrollout_length = {0}\n'
-    folders = [written(tmp_path / f"{i}", [row(10, 0, 1.0)], config.format(i)) for i in range(1, 9)]
-    out = tmp_path / "curves.svg"
-    plot.draw([plot.read(folder) for folder in folders], out)
-    names = re.findall(r'<text [^>]* x="([\d.-]+)" y="([\d.-]+)"[^>]*>(mappo_l, critic_lr[^<]*)<', out.read_text())
-    assert len(names) == 8 and len({y for _, y, _ in names}) == 8
-    width = float(re.findall(r'width="([\d.]+)pt"', out.read_text())[0])
-    assert all(0 < float(x) < width - 4 * len(text) for x, _, text in names)  # a letter is over 4 points wide
-
-
-def test_plot_draws_every_figure_that_there_is(lane: pathlib.Path, tmp_path: pathlib.Path, cli):
-    plain = written(tmp_path / "plain", [row(10, 0, 1.0, episode_cost=0.5), row(20, 0, 2.0, episode_cost=None)])
-    out = tmp_path / "curves.svg"
-    assert cli("plot", lane, plain, "-o", out)[0] == 0
-    text = out.read_text()
-    for words in (
-        "reward of an episode",
-        "dashed: limit",
-        "multiplier",
-        "fear: Brier score",
-        "f4sg (2 seeds)",
-        "mappo_l",
-    ):
-        assert words in text
-    assert "regret" not in text
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # Pages
 
 
@@ -338,7 +257,7 @@ def test_a_report_tells_all_there_is(pages: pathlib.Path, lane: pathlib.Path):
     text = (pages / "report.html").read_text()
     assert text.count("<svg") == 8  # four figures of training, four of fear
     assert "seed 3, sampled" in text and "seed 4, mean" in text and " ± " in text
-    for words in ("lambda_lr", "matmul_precision", "1,000 environment steps a seed", "All figures of the task"):
+    for words in ("lambda_lr", "matmul_precision", "1,000 environment steps a seed", "All metrics of the task"):
         assert words in text
     assert data_of(text)[0]["kind"] == "plain" and len(data_of(text)[0]["reward"]) == 26
     assert not re.search(r'(?:src|href)="(?!data:|#)|@import|url\((?!#)', text)  # nothing that lies elsewhere
@@ -423,8 +342,6 @@ def test_a_replay_plays_scrubs_and_flags_the_cost(pages: pathlib.Path, tab: head
         (["render", "RUN", "--size", "big"], "--size must be WIDTHxHEIGHT"),
         (["render", "RUN", "-o", "file/x.html"], "cannot write file/x.html"),
         (["plot"], "the following arguments are required: RUN"),
-        (["plot", "none"], "none is not a run folder: there is no such folder"),
-        (["plot", "."], "has no figures to draw: cannot read its metrics.jsonl (No such file or directory)"),
         (["plot", "RUN", "-o", "x.txt"], "its ending must be .png, .svg or .pdf"),
         (["report", "RUN", "-o", "x.pdf"], "the ending of a report must be .html"),
         (["report", "RUN", "--episodes", "none"], "--episodes must be a whole number of at least 1"),
@@ -439,11 +356,9 @@ def test_mistakes_get_one_sentence(arguments: list[str], says: str, lane: pathli
 
 
 def test_a_missing_package_is_named_with_the_command_that_brings_it(lane: pathlib.Path, cli, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    for words in (["plot", lane], ["report", lane], ["render", lane, "-o", tmp_path / "x.mp4"]):
-        code, _, err = cli(*words)
-        assert code == 2 and "which is missing here: pip install 'pmt-jax[render]'" in err
+    code, _, err = cli("render", lane, "-o", tmp_path / "x.mp4")
+    assert code == 2 and "which is missing here: pip install 'pmt-jax[render]'" in err
 
 
 def test_a_run_is_drawn_from_a_folder_that_cannot_be_written(lane: pathlib.Path, tmp_path: pathlib.Path, cli):

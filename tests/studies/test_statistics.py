@@ -1,4 +1,4 @@
-"""Robust figures over few runs: numbers worked by hand, and laws."""
+"""Metrics over few seeds: numbers worked by hand, laws, and intervals that cover as often as they say."""
 
 from __future__ import annotations
 
@@ -20,62 +20,81 @@ def test_interquartile_mean_by_hand():
     assert statistics.iqm([5.0]) == 5
     assert statistics.iqm([1, 2, 6]) == 3  # fewer than four: the mean
     assert statistics.iqm([1000, 1, 3, 2, -500]) == 2  # five: one off each end
-    assert statistics.iqm([[0, 1, 2, 3], [4, 5, 6, 100]]) == (2 + 3 + 4 + 5) / 4  # two tasks together
-
-
-@given(scores)
-def test_interquartile_mean_is_scipys_trimmed_mean(x: list[float]):
-    np.testing.assert_allclose(statistics.iqm(x), scipy.stats.trim_mean(x, 0.25), atol=1e-9)
+    assert statistics.iqm([[0, 1, 2, 3], [4, 5, 6, 100]]) == (2 + 3 + 4 + 5) / 4
 
 
 def test_probability_of_improvement_by_hand():
     better = statistics.probability_of_improvement
     assert better([[2, 3]], [[1, 2]]) == (1 + 0.5 + 1 + 1) / 4
-    assert better([[2, 3], [0, 0, 0]], [[1, 2], [1]]) == (0.875 + 0) / 2  # tasks weigh the same, runs may differ
+    assert better([[2, 3], [0, 0, 0]], [[1, 2], [1]]) == (0.875 + 0) / 2  # tasks weigh the same, seeds may differ
     with pytest.raises(ValueError):
         better([[1, 2]], [[1], [2]])
 
 
 @given(scores, scores)
-def test_probability_of_improvement_is_mann_whitneys(x: list[float], y: list[float]):
+def test_improvement_of_one_side_is_deterioration_of_the_other(x: list[float], y: list[float]):
     p = statistics.probability_of_improvement([x], [y])
-    np.testing.assert_allclose(p, scipy.stats.mannwhitneyu(x, y, method="asymptotic").statistic / len(x) / len(y))
     np.testing.assert_allclose(p + statistics.probability_of_improvement([y], [x]), 1)
+    low, high = statistics.improvement_interval([x], [y])
+    assert -1e-9 <= low <= p <= high <= 1 + 1e-9
+    assert high - low > 0.1  # eight seeds never make it certain
 
 
-def test_bootstrap_of_two_scores_by_hand():
-    """A resample of {0, 1} has the mean 0, 1/2, 1 with probability 1/4, 1/2, 1/4."""
-    assert statistics.bootstrap_interval([[0, 1]]) == (0, 1)
-    assert statistics.bootstrap_interval([[0, 1]], level=0.4) == (0.5, 0.5)
-    # Two tasks of one run each: a stratified resample is always the scores themselves.
-    assert statistics.bootstrap_interval([[0], [1]]) == (0.5, 0.5)
+def test_intervals_by_hand():
+    """Student's for two scores, 12.706 standard errors; and the same for an IQM from which nothing is cut."""
+    np.testing.assert_allclose(statistics.mean_interval([0, 2]), (1 - 12.706, 1 + 12.706), rtol=1e-4)
+    assert statistics.iqm_interval([0, 2, 5]) == statistics.mean_interval([0, 2, 5])
+    assert np.isnan(statistics.mean_interval([1])).all() and np.isnan(statistics.iqm_interval([1])).all()
+    assert statistics.iqm_interval([3, 3, 3, 3, 3]) == (3, 3)
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(scores, min_size=1, max_size=3), st.floats(-100, 100))
-def test_bootstrap_laws(strata: list[list[float]], shift: float):
-    low, high = statistics.bootstrap_interval(strata, resamples=200)
-    everything = np.concatenate(strata)
-    assert everything.min() - 1e-9 <= low <= high <= everything.max() + 1e-9
-    moved = statistics.bootstrap_interval([np.add(x, shift) for x in strata], resamples=200)
-    np.testing.assert_allclose(moved, (low + shift, high + shift), atol=1e-8)
-    assert statistics.bootstrap_interval(strata, resamples=200) == (low, high)
-    p = statistics.improvement_interval(strata, strata, resamples=200)
-    assert 0 <= p[0] <= p[1] <= 1
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=8), st.floats(-100, 100))
+def test_intervals_move_with_the_scores(x: list[float], shift: float):
+    for interval in (statistics.mean_interval, statistics.iqm_interval):
+        low, high = interval(x)
+        assert low <= high and interval(x) == (low, high)
+        np.testing.assert_allclose(interval(np.add(x, shift)), (low + shift, high + shift), atol=1e-6)
 
 
-def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
-    rng = np.random.default_rng(1)
-    hits = [low <= 0 <= high for low, high in (_normal_interval(rng) for _ in range(200))]
-    assert 0.85 < np.mean(hits) < 0.99  # 0.95 in the limit of many runs; 20 here
+@pytest.mark.parametrize("seeds", [5, 20])
+@pytest.mark.parametrize("draw", ["normal", "standard_t", "exponential"])
+def test_intervals_cover_what_they_estimate_as_often_as_they_say(seeds: int, draw: str):
+    """95 % of 2,000 samples, normal, with heavy tails, or skewed; the percentile bootstrap's covers 81 to 91 % of five.
+
+    The count has a standard deviation of .005. Skewed scores lower both intervals' coverage, the mean's most.
+    """
+    rng = np.random.default_rng(0)
+    sample = {"standard_t": lambda n: rng.standard_t(3, n)}.get(draw, lambda n: getattr(rng, draw)(size=n))
+    everything = sample(1_000_000)
+    truth = {statistics.mean_interval: everything.mean(), statistics.iqm_interval: statistics.iqm(everything)}
+    for interval, value in truth.items():
+        found = [interval(sample(seeds)) for _ in range(2000)]
+        covered = np.mean([low <= value <= high for low, high in found])
+        skewed_mean = draw == "exponential" and interval is statistics.mean_interval
+        assert (0.86 if skewed_mean else 0.92) < covered < 0.985
 
 
-def _normal_interval(rng: np.random.Generator) -> tuple[float, float]:
-    return statistics.bootstrap_interval([rng.normal(size=20)], np.mean, resamples=500)
+@pytest.mark.parametrize("seeds", [5, 20])
+def test_the_interval_of_an_improvement_covers_it(seeds: int):
+    rng = np.random.default_rng(0)
+    for shift in (0.0, 1.0, 2.0):
+        truth = scipy.stats.norm.cdf(shift / 2**0.5)
+        pairs = (([rng.normal(shift, size=seeds)], [rng.normal(size=seeds)]) for _ in range(400))
+        covered = np.mean([low <= truth <= high for low, high in (statistics.improvement_interval(*p) for p in pairs)])
+        assert 0.91 < covered < 0.99
 
 
-def test_improvement_is_certain_where_every_run_is_better():
-    assert statistics.improvement_interval([[3, 4, 5]], [[0, 1, 2]]) == (1, 1)
+def test_the_u_test_by_hand():
+    """Of the 10 and of the 252 ways to rank them, two are as far apart as complete separation."""
+    np.testing.assert_allclose(statistics.u_test([4, 5, 6], [1, 2]), 2 / 10)
+    np.testing.assert_allclose(statistics.u_test([6, 7, 8, 9, 10], [1, 2, 3, 4, 5]), 2 / 252)
+    assert statistics.u_test([1, 1], [1, 1]) == 1
+
+
+def test_holms_correction_by_hand():
+    np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03, 0.5]), [0.04, 0.09, 0.09, 0.5])
+    assert statistics.holm([0.6, 0.7]) == [1, 1] and statistics.holm([]) == []
 
 
 def test_needs_no_jax():

@@ -1,4 +1,4 @@
-"""Sweeps, tables, and the paper's tables: points are runs, nothing finished is lost, figures are what they say."""
+"""Sweeps and the paper's tables: points are runs, and nothing finished is lost."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 import tomli_w
 
 from pmt_jax import load_config
-from pmt_jax.config.settings import to_toml
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
-from pmt_jax.studies import sweep, table
+from pmt_jax.studies import reproduce, sweep, table
+from pmt_jax.studies.points import Part, make_points
 from pmt_jax.training import checkpoint
 from pmt_jax.training.loggers import Jsonl
 from pmt_jax.training.run_folder import load_saved
@@ -145,152 +145,11 @@ def test_points_of_one_program_keep_to_their_own_limits(tmp_path: pathlib.Path, 
 
 def test_what_is_traced_shares_a_program_and_what_is_static_does_not(tmp_path: pathlib.Path):
     vary = {"method": ["happo", "f4sg"], "lambda_lr": ["0.1", "0.30"], "cost_limit": ["1", "2"], "seed": ["0", "5"]}
-    points = sweep.grid("lane", vary)
+    points = make_points([Part("lane", vary)])
     assert len(points) == 16 and "method=f4sg,lambda_lr=0.3,cost_limit=2,seed=5" in points
     groups = [list(group.values()) for _, group in sweep._groups(points, points, tmp_path)]
     assert [len(group) for group in groups] == [8, 8]
     assert all(len({c.method for c in group}) == 1 for group in groups)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--set", "lamda_lr=1"], "unknown setting 'lamda_lr'; did you mean 'lambda_lr'?"),
-        (["--set", "clip"], "--set takes NAME=VALUE,VALUE,..., not 'clip'"),
-        (["--set", "clip=0.1,wide"], "clip = 'wide' does not fit: expected a number"),
-        (["--set", "method=happo,hapo"], "unknown method 'hapo'; did you mean 'happo'?"),
-        (["--set", "task=lane,noisy"], "a sweep has one task"),
-        ([], "the following arguments are required: --set"),
-    ],
-)
-def test_mistakes_get_one_sentence(arguments: list[str], says: str, tmp_path: pathlib.Path, cli):
-    code, _, err = cli("sweep", "lane", *arguments, "--out", tmp_path / "x")
-    assert code == 2 and says in err and err.count("\n") == 1 and not (tmp_path / "x").exists()
-
-
-def test_a_value_with_commas_stands_in_brackets(monkeypatch, cli):
-    seen = {}
-    monkeypatch.setattr(sweep, "sweep", lambda points, *_, **__: seen.update(points) or 0)
-    assert cli("sweep", "lane", "--set", "hidden=[64,32],16", "--out", "x")[0] == 0
-    assert {name: config.hidden for name, config in seen.items()} == {"hidden=64,32": (64, 32), "hidden=16": (16,)}
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Tables
-
-
-def made(folder: pathlib.Path, task: str, method: str, seeds: dict[int, list[float | None]], **more: object) -> None:
-    """A run folder of ten rows a seed, of which the last has the reward and the cost given."""
-    changes = {name: more.pop(name) for name in list(more) if name in ("clip", "seed")}
-    folder.mkdir(parents=True)
-    config = load_config(task, method=method, seeds=len(seeds), steps=24_000, **changes)
-    (folder / "config.toml").write_text(to_toml(config))
-    lines = []
-    for step in range(1, 11):
-        for seed, (reward, cost) in seeds.items():
-            row = {"step": 1000 * step, "seed": seed, "task": task, "method": method, "cost_limit": 1.0}
-            figures = {"episode_reward": reward, "episode_cost": cost, "violation_rate": 0.25}
-            lines.append(json.dumps({**row, **(figures if step == 10 else dict.fromkeys(figures, -99)), **more}) + "\n")
-    (folder / "metrics.jsonl").write_text("".join(lines))
-
-
-def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
-    made(tmp_path / "a", "lane", "mappo_l", {0: [1, 1], 1: [2, 1], 2: [3, 0.5]})
-    made(tmp_path / "b", "lane", "f4sg", {0: [1, 0], 1: [8, 0]})
-    made(tmp_path / "c", "lane", "f4sg", {5: [2, 0], 6: [3, 0.8]}, seed=5)  # more seeds of the same
-    code, out, _ = cli("table", tmp_path, "--format", "json", "--baseline", "mappo_l")
-    data = {row["method"]: row for row in json.loads(out)["rows"]}
-    assert code == 0 and list(data) == ["mappo_l", "f4sg"]
-    assert data["mappo_l"]["reward"] == {"iqm": 2, "low": 1, "high": 3}
-    assert data["f4sg"]["seeds"] == 4 and data["f4sg"]["reward"]["iqm"] == 2.5  # 1 and 8 are cut off
-    assert data["f4sg"]["violation rate"] == {"iqm": 0.25, "low": 0.25, "high": 0.25}
-    # 12 pairs: 1 ties with 1; 8 wins 3; 2 wins 1 and ties 1; 3 wins 2 and ties 1.
-    assert data["f4sg"]["better"]["reward"]["probability"] == 7.5 / 12
-    assert data["f4sg"]["better"]["cost"]["probability"] == (3 * 3 + 2) / 12  # less cost is better
-    assert data["mappo_l"]["better"] is None
-
-
-def test_a_table_says_who_left_the_corridor(tmp_path: pathlib.Path, cli):
-    made(tmp_path / "a", "ant_2x4", "happo", {0: [1, 1]}, **{"info/outside": 0.5})
-    made(tmp_path / "b", "lane", "happo", {0: [1, 1]})
-    assert "outside: share of steps beyond a wall" in cli("table", tmp_path / "a")[1]
-    head, _, ant, lane = cli("table", tmp_path)[1].splitlines()[:4]
-    place = head.index("outside")
-    assert ant[place:].startswith("0.5 ") and lane[place:].startswith("- ")
-    assert "outside" not in cli("table", tmp_path / "b")[1]
-
-
-def test_settings_that_differ_make_rows_of_their_own(tmp_path: pathlib.Path, cli):
-    made(tmp_path / "a", "lane", "happo", {0: [1, 1]}, clip=0.1)
-    made(tmp_path / "b", "lane", "happo", {0: [2, 2]}, clip=0.2)
-    code, out, _ = cli("table", tmp_path / "a", tmp_path / "b")
-    assert code == 0 and "happo clip=0.1" in out and "happo clip=0.2" in out
-    assert "'happo' means several rows of lane" in cli("table", tmp_path, "--baseline", "happo")[2]
-    assert cli("table", tmp_path, "--baseline", "happo clip=0.1")[0] == 0
-    made(tmp_path / "c", "lane", "happo", {0: [3, 3]}, clip=0.2)
-    assert "seed 0 counts twice" in cli("table", tmp_path)[2]
-
-
-def test_figures_come_from_evaluations_where_there_are_any(tmp_path: pathlib.Path, cli):
-    judged = {"eval/episode_reward": 7.0, "eval/episode_cost": 0.5, "eval/violation_rate": 0.125}
-    made(tmp_path / "a", "lane", "happo", {0: [1, 1]}, **judged)
-    made(tmp_path / "b", "lane", "mappo", {0: [1, 1]})
-    text = cli("table", tmp_path)[1]
-    happo, mappo = (next(line for line in text.splitlines() if f" {m} " in line) for m in ("happo", "mappo"))
-    assert "7 [7, 7]  0.5 [0.5, 0.5]  0.125" in happo and "1 [1, 1]" in mappo
-    assert "evaluation episodes (mean actions)" in text and "training episodes (sampled actions)" in text
-
-
-def test_a_seed_without_a_figure_shows(tmp_path: pathlib.Path, cli):
-    made(tmp_path / "a", "lane", "happo", {0: [1, 1], 1: [None, None]})
-    made(tmp_path / "b", "lane", "mappo", {0: [1, 1]}, **{"critic/loss": None})
-    made(tmp_path / "c", "noisy", "happo", {0: [1, 1]})
-    lines = [line.split() for line in cli("table", tmp_path, "--baseline", "mappo")[1].splitlines()[2:5]]
-    assert lines[0][:6] == ["lane", "mappo", "1", "10,000", "-", "-"]
-    assert lines[1][:6] == ["lane", "happo", "2", "10,000", "-", "-"]
-    assert lines[2][:6] == ["noisy", "happo", "1", "10,000", "1", "[1,"]  # a task without the baseline
-
-
-def test_the_papers_numbers_stand_beside_ours_in_every_format(tmp_path: pathlib.Path, cli):
-    made(tmp_path / "a", "ant_2x4", "f4sg", {0: [100, 1]})
-    made(tmp_path / "b", "voltage_33", "happo", {0: [1, 1]}, **{"info/totally_controllable_ratio": 0.5})
-    text = cli("table", tmp_path)[1]
-    ant = next(line for line in text.splitlines() if line.startswith("ant_2x4"))
-    assert ant.split()[-2:] == ["2880.68", "4.02"] and "ant_2x4: Table 1" in text
-    assert "CR" in text and "PL" not in text.splitlines()[0]
-    target = tmp_path / "table.md"
-    code, out, _ = cli("table", tmp_path, "--format", "markdown", "-o", target)
-    assert code == 0 and not out
-    lines = target.read_text().splitlines()
-    assert lines[1] == "|---" * (lines[0].count("|") - 1) + "|" and "| 2880.68 | 4.02 |" in lines[2]
-    latex = cli("table", tmp_path, "--format", "latex")[1]
-    assert r"ant\_2x4 & f4sg & 1 & " in latex and latex.rstrip().endswith(r"\end{tabular}")
-
-
-def test_improvement_over_all_tasks_weighs_tasks_alike(tmp_path: pathlib.Path, cli):
-    for task, reward in (("lane", 5), ("noisy", 1)):
-        made(tmp_path / task / "base", task, "mappo_l", {0: [2, 1], 1: [3, 1]})
-        made(tmp_path / task / "ours", task, "f4sg", {0: [reward, 1]})
-    text = cli("table", tmp_path, "--baseline", "mappo_l")[1]
-    assert "All tasks together, f4sg: P(more reward) 0.5 [0.5, 0.5], P(less cost) 0.5 [0.5, 0.5]." in text
-
-
-def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
-    assert f"{tmp_path} holds no run" in cli("table", tmp_path)[2]
-    made(tmp_path / "a", "lane", "happo", {0: [1, 1]})
-    assert "unknown format 'html'" in cli("table", tmp_path, "--format", "html")[2]
-    assert "no row is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
-    assert "cannot write" in cli("table", tmp_path, "-o", tmp_path / "no" / "where")[2]
-
-
-def test_the_best_row_is_the_one_with_most_reward_within_the_limit():
-    def row(reward: float, cost: float) -> table.Row:
-        figures = {"reward": np.array([reward]), "cost": np.array([cost])}
-        return table.Row("lane", "happo", "", 1.0, 1, "training", figures)
-
-    best = [row(2, 1.0), row(1, 0.0), row(9, 1.5), row(5, 3.0), row(np.nan, np.nan)]
-    shuffled = [best[i] for i in (4, 2, 0, 3, 1)]
-    assert sorted(shuffled, key=lambda r: r.rank) == best
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -322,23 +181,21 @@ def test_the_papers_plans_can_be_made():
         assert wanted["baseline"] in wanted.get("methods", ["mappo_l"])
         for budget in paper["budgets"].values():
             for task in set(wanted["tasks"]) & set(paper["tasks"]):
-                assert task in sweep.names() or task == "hand_over_2x6"
-                if task in sweep.names():
-                    assert len(sweep._plan(task, ["f4sg", "mixed"], budget)) == 2
+                assert len(reproduce.plan(task, ["f4sg", "mixed"], budget)) == 2
 
 
 def test_reproduce_says_what_is_not_there(cli, monkeypatch, tmp_path: pathlib.Path):
     assert "unknown table 'table4'; did you mean 'table" in cli("reproduce", "table4")[2]
     assert "unknown budget 'large'" in cli("reproduce", "table1", "--budget", "large")[2]
-    monkeypatch.setattr(sweep, "names", lambda: ["lane"])
+    monkeypatch.setattr(reproduce, "names", lambda: ["lane"])
     code, _, err = cli("reproduce", "table2", "--out", tmp_path / "x")
     assert code == 2 and "table2 needs the task 'hand_over_2x6', which this version of pmt-jax does not have" in err
 
     def refuse(config: object) -> None:
         raise UsageError("no engine here")
 
-    monkeypatch.setattr(sweep, "names", lambda: ["ant_2x4", "ant_4x2"])
-    monkeypatch.setattr(sweep, "make_setup", refuse)
+    monkeypatch.setattr(reproduce, "names", lambda: ["ant_2x4", "ant_4x2"])
+    monkeypatch.setattr(reproduce, "make_setup", refuse)
     assert "no engine here" in cli("reproduce", "table1", "--out", tmp_path / "x")[2]
     assert not (tmp_path / "x").exists()
 

@@ -1,0 +1,54 @@
+"""`pmt reproduce`: the paper's tables, trained and printed beside the paper's numbers."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Mapping, Sequence
+
+from ..config.methods import METHODS
+from ..errors import UsageError
+from ..learning.setup import make_setup
+from ..tasks import did_you_mean, names
+from . import table
+from .points import Part, Points, make_points
+from .rows import rows
+from .run_log import read_all
+from .sweep import ONE_AT_A_TIME, Launch, missing_programs, train_programs
+
+
+def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
+    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
+
+    Args:
+      name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
+
+    Raises:
+      UsageError: an unknown table or budget, or a task that cannot run here.
+    """
+    paper = table.paper()
+    for what, word, known in (("table", name, paper["tables"]), ("budget", budget, paper["budgets"])):
+        if word not in known:
+            raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
+    wanted, settings = paper["tables"][name], paper["budgets"][budget]
+    absent = [task for task in wanted["tasks"] if task not in names()]
+    if absent:
+        raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
+    plans = {task: plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
+    for points in plans.values():
+        make_setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
+    code = train_programs(
+        [program for task, points in plans.items() for program in missing_programs(points, out / task, launch.say)],
+        launch,
+    )
+    if code:
+        return code
+    logs = read_all([out / task / point for task, points in plans.items() for point in points])
+    launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
+    launch.say(table.render(rows(logs), form, wanted["baseline"]))
+    return 0
+
+
+def plan(task: str, methods: Sequence[str], budget: Mapping[str, str]) -> Points:
+    """A budget's settings of a task: its `source` in configs/ for that task, or its `preset` over the task's own."""
+    source = budget.get("source", "{task}").format(task=task)
+    return make_points([Part(source, {"method": methods})], preset=budget.get("preset", "default"))

@@ -1,0 +1,146 @@
+"""Rows of a table: one score per seed and column, pooled over runs that share task, method and settings.
+
+A score is a metric's mean over the last tenth of the steps, of the evaluations made there (`eval/...` in metrics.jsonl:
+whole episodes under mean actions) where the run made any, else of the training episodes that ended there (sampled
+actions).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..config.methods import METHODS
+from ..errors import UsageError
+from ..tasks import columns as task_columns
+from . import statistics
+from .run_log import Group, RunLog, groups
+
+
+class Column(NamedTuple):
+    """A metric as a column.
+
+    Attributes:
+      name: the column's head.
+      metric: its name in metrics.jsonl.
+      low, high: no value lies beyond; intervals are cut there.
+      note: what it is, under the table.
+    """
+
+    name: str
+    metric: str
+    low: float = -math.inf
+    high: float = math.inf
+    note: str = ""
+
+
+COLUMNS = (
+    Column("reward", "episode_reward", note="reward: undiscounted, of the team, per episode"),
+    Column("cost", "episode_cost", 0, note="cost: undiscounted, of one agent (mean over agents), per episode"),
+    Column("violation rate", "violation_rate", 0, 1, "violation rate: share of steps with a cost for some agent"),
+    Column("true cost", "true_episode_cost", 0, note="true: with the costs that the team did not feel"),
+    Column("true violation rate", "true_violation_rate", 0, 1),
+    Column("true step cost", "true_step_cost", 0),
+)
+
+
+def columns(tasks: Iterable[str]) -> list[Column]:
+    """All columns that runs of these tasks may have, in order: the common ones, then what the tasks declare."""
+    declared = {name: column for task in tasks for name, column in task_columns(task).items()}
+    own = (Column(c.name, f"info/{x}", c.low, c.high, f"{c.name}: {c.definition}") for x, c in declared.items())
+    return [*COLUMNS, *own]
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """The seeds of all runs with the same task, method and settings.
+
+    Attributes:
+      task, method: their names; settings: what differs from other rows of the same task, as `name=value`.
+      cost_limit: allowed cost of one agent per episode; true_limit: the same of true costs (see `cost_seen`).
+      steps: environment steps per seed (the fewest, where runs differ).
+      source: `evaluation` or `training`, what the scores are taken from.
+      scores: {column: [seeds]} in the task's units; nan where a seed has none.
+    """
+
+    task: str
+    method: str
+    settings: str
+    cost_limit: float
+    steps: int
+    source: str
+    scores: dict[str, np.ndarray]
+    true_limit: float = math.nan
+
+    @property
+    def within(self) -> np.ndarray:
+        """[seeds] bool: its cost is within the limit, the true one where it is known."""
+        true = "true cost" in self.scores and not math.isnan(self.true_limit)
+        return self.scores["true cost"] <= self.true_limit if true else self.scores["cost"] <= self.cost_limit
+
+    @property
+    def label(self) -> str:
+        """The method, and what sets it apart."""
+        return " ".join(filter(None, (self.method, self.settings)))
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Sorts the best first: by reward within the cost limit, then by cost beyond it; nan last."""
+        reward, cost = (statistics.iqm(self.scores[name]) for name in ("reward", "cost"))
+        safe = cost <= self.cost_limit
+        key = -reward if safe else cost
+        return (not safe, math.inf if math.isnan(key) else key)
+
+
+def rows(logs: Sequence[RunLog]) -> list[Row]:
+    """One row per task, method and settings, in the order of the tasks' names and of METHODS.
+
+    Raises:
+      UsageError: two runs of one row have trained the same seed, or only one of them was evaluated.
+    """
+    return in_order([_row(group) for group in groups(logs)])
+
+
+def in_order(rows: Sequence[Row]) -> list[Row]:
+    """Sorted by task, then as METHODS is; methods that are not in it last."""
+    order = list(METHODS)
+    return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
+
+
+def _row(group: Group) -> Row:
+    first, last = group.runs[0], group.runs[-1]
+    if len({run.evaluated for run in group.runs}) > 1:
+        raise UsageError(f"{first.folder} and {last.folder} cannot share a row: only one was evaluated in training")
+    scores = {column.name: group.final(column.metric) for column in columns([group.task])}
+    return Row(
+        task=group.task,
+        method=group.method,
+        settings=group.settings,
+        cost_limit=group.cost_limit,
+        steps=int(min(run.steps[-1] for run in group.runs)),
+        source="evaluation" if first.evaluated else "training",
+        scores={name: x for name, x in scores.items() if x is not None},
+        true_limit=group.true_limit,
+    )
+
+
+def shown(rows: Sequence[Row]) -> list[Column]:
+    """The columns that any row has, in order; true costs only where a run did not feel all of them."""
+    every = columns(row.task for row in rows)
+    present = [column for column in every if any(column.name in row.scores for row in rows)]
+    felt = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)
+    return [column for column in present if not (felt and column.name.startswith("true "))]
+
+
+def same(true: np.ndarray | None, felt: np.ndarray | None) -> bool:
+    """Whether true costs are the felt ones, as far as both are known."""
+    return true is None or felt is None or np.array_equal(true, felt, equal_nan=True)
+
+
+def compared(rows: Sequence[Row]) -> tuple[str, str]:
+    """The columns that rows are compared by: reward, and the cost as it was, felt or not."""
+    return "reward", "true cost" if "true cost" in [column.name for column in shown(rows)] else "cost"

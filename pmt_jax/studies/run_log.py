@@ -1,0 +1,326 @@
+"""Run folders as they are read: settings, metrics of every seed, versions, and which runs are the same up to seeds.
+
+Tables, plots and reports all read through here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import pathlib
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..config.settings import Config, load_config
+from ..errors import UsageError
+from ..files import read_rows
+
+LAST = 0.1  # share of the steps that a run's final metrics are averaged over
+NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
+IDENTITY = {"step": int, "seed": int, "task": str, "method": str, "cost_limit": float}  # what every row says
+TEXT = ("broken",)  # besides
+
+Say = Callable[[str], object]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunLog:
+    """What a run folder says of a training run.
+
+    Attributes:
+      folder: where it lies.
+      task, method: what was trained, and how.
+      cost_limit: allowed cost of one agent per episode.
+      settings: {setting: value}, the task's own options as env.NAME.
+      seeds: [S], ascending.
+      steps: [P] environment steps of one seed, ascending.
+      metrics: {name: [S, P]} the metrics that are numbers, nan where unknown.
+      versions: what the numbers depend on besides the settings.
+      broken: seeds that stopped training before the end, which have no final metrics.
+    """
+
+    folder: pathlib.Path
+    task: str
+    method: str
+    cost_limit: float
+    settings: dict[str, Any]
+    seeds: tuple[int, ...]
+    steps: np.ndarray
+    metrics: dict[str, np.ndarray]
+    versions: dict[str, Any] = dataclasses.field(default_factory=dict)
+    broken: tuple[int, ...] = ()
+
+    @property
+    def identity(self) -> str:
+        """Equal for two runs that are the same up to their seeds."""
+        learned = {name: value for name, value in self.settings.items() if name not in NOT_LEARNING}
+        return repr((self.task, self.method, self.cost_limit, sorted(learned.items()) or self.folder))
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether the final metrics come from evaluations, not from training."""
+        return bool(np.isfinite(self._last("eval/episode_reward")).any())
+
+    def final(self, name: str) -> np.ndarray | None:
+        """[S] means of a metric over the last tenth of the steps, nan for a seed that broke; None if unknown.
+
+        Where evaluations were made there, they count and not the training episodes.
+        """
+        source = f"eval/{name}" if self.evaluated else name
+        if source not in self.metrics:
+            return None
+        values = self._last(source)
+        known = np.isfinite(values)
+        mean = np.where(known, values, 0.0).sum(1) / np.maximum(known.sum(1), 1)
+        return np.where(known.any(1) & ~np.isin(self.seeds, self.broken), mean, np.nan)
+
+    def thinned(self, points: int) -> RunLog:
+        """The same run with its metrics averaged into at most so many points, over what is known in each."""
+        starts = [part[0] for part in np.array_split(np.arange(len(self.steps)), min(points, len(self.steps)))]
+        steps = self.steps[[*(start - 1 for start in starts[1:]), -1]]
+        return dataclasses.replace(
+            self, steps=steps, metrics={name: _averaged(values, starts) for name, values in self.metrics.items()}
+        )
+
+    def _last(self, name: str) -> np.ndarray:
+        """[S, p] a metric over the last tenth of the steps."""
+        nothing = np.full((len(self.seeds), len(self.steps)), np.nan)
+        return self.metrics.get(name, nothing)[:, self.steps > (1 - LAST) * self.steps[-1]]
+
+
+def _averaged(values: np.ndarray, starts: list[int]) -> np.ndarray:
+    """[S, P] means over what is known of `values` [S, R] from each of `starts` to the next."""
+    known = np.isfinite(values)
+    count = np.add.reduceat(known, starts, axis=1, dtype=int)
+    total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Reading
+
+
+def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[RunLog]:
+    """The runs among and below `paths`; what holds none is left out with a note.
+
+    Raises:
+      UsageError: a path does not exist, none of them holds a run with metrics, or a run cannot be read.
+    """
+    note = note or _to_stderr
+    logs, reasons = [], []
+    for path in dict.fromkeys(paths):
+        if str(path).startswith("hub:"):
+            raise UsageError(f"{path} is a pretrained policy, which has no metrics of its training; name a run folder")
+        if not path.exists():
+            raise UsageError(f"{path} is not a run folder: there is no such folder")
+        folders = list(_folders(path))
+        if not folders:
+            reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
+        for folder in folders:
+            if any(log.folder == folder for log in logs):
+                continue
+            log = read(folder)
+            if log is None:
+                reasons.append(f"{folder} has no metrics yet: its metrics.jsonl is empty")
+            else:
+                logs.append(log)
+    if not logs:
+        raise UsageError("; ".join(reasons) or "no run folder was named")
+    for reason in reasons:
+        note(f"left out: {reason}")
+    return logs
+
+
+def _to_stderr(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """The run folders at and below `path`; hidden folders are left out."""
+    for file in sorted(path.rglob("metrics.jsonl")):
+        hidden = any(part.startswith(".") for part in file.parent.relative_to(path).parts)
+        if not hidden and (file.parent / "config.toml").is_file():
+            yield file.parent
+
+
+def read(folder: pathlib.Path) -> RunLog | None:
+    """The run in `folder`; None where it has no metrics yet.
+
+    Lines cut off in the middle are left out; where a step stands twice, the later line counts.
+
+    Raises:
+      UsageError: settings or metrics that cannot be read, or are of the wrong type.
+    """
+    metrics = folder / "metrics.jsonl"
+    try:
+        rows = read_rows(metrics, missing_ok=False)
+    except OSError as error:
+        raise UsageError(f"{folder} has no metrics: cannot read its metrics.jsonl ({error.strerror})") from None
+    if not rows:
+        return None
+    for row in rows:
+        _check(row, metrics)
+    steps, seeds = (sorted({row[name] for row in rows}) for name in ("step", "seed"))
+    last = max(rows, key=lambda row: row["step"])
+    return RunLog(
+        folder=folder,
+        task=last["task"],
+        method=last["method"],
+        cost_limit=last["cost_limit"],
+        settings=flat(load_config(folder / "config.toml")),
+        seeds=tuple(seeds),
+        steps=np.array(steps),
+        metrics=_metrics(rows, seeds, steps, metrics),
+        versions=_versions(folder),
+        broken=tuple(sorted({row["seed"] for row in rows if row.get("broken") is not None})),
+    )
+
+
+def _check(row: dict[str, Any], file: pathlib.Path) -> None:
+    """Raises UsageError where a row's identity is missing or of the wrong type."""
+    for name, kind in IDENTITY.items():
+        value = row.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float if kind is float else kind):
+            words = {int: "a whole number", str: "a word", float: "a number"}[kind]
+            raise UsageError(f"{file}: a row has {name} = {json.dumps(value)[:40]}, where {words} belongs")
+
+
+def _metrics(
+    rows: Sequence[dict[str, Any]], seeds: list[int], steps: list[int], file: pathlib.Path
+) -> dict[str, np.ndarray]:
+    """{name: [S, P]} of the rows of `file`."""
+    seed_at, step_at = ({value: i for i, value in enumerate(x)} for x in (seeds, steps))
+    found: dict[str, np.ndarray] = {}
+    for row in rows:
+        place = seed_at[row["seed"]], step_at[row["step"]]
+        for name, value in row.items():
+            if name in IDENTITY or name in TEXT:
+                continue
+            if name not in found:
+                found[name] = np.full((len(seeds), len(steps)), np.nan)
+            try:
+                found[name][place] = math.nan if value is None else value
+            except (TypeError, ValueError):
+                where = f"{name} = {json.dumps(value)[:40]} at step {row['step']}"
+                raise UsageError(f"{file}: a row has {where}, where a number or null belongs") from None
+    return found
+
+
+def _versions(folder: pathlib.Path) -> dict[str, Any]:
+    try:
+        versions = json.loads((folder / "versions.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return versions if isinstance(versions, dict) else {}
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """{setting: value} of a run, the task's own options as env.NAME."""
+    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    options = dict(settings.pop("env"))
+    return settings | {f"env.{name}": value for name, value in options.items()}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Runs that are the same up to seeds
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but their seeds.
+
+    Attributes:
+      runs: at least one.
+      settings: what sets it apart from other groups of its task and method, as `name=value name=value`.
+    """
+
+    runs: tuple[RunLog, ...]
+    settings: str = ""
+
+    @property
+    def task(self) -> str:
+        """What was trained."""
+        return self.runs[0].task
+
+    @property
+    def method(self) -> str:
+        """How it was trained."""
+        return self.runs[0].method
+
+    @property
+    def cost_limit(self) -> float:
+        """The limit on what the team feels."""
+        return self.runs[0].cost_limit
+
+    @property
+    def true_limit(self) -> float:
+        """The limit on true costs, of which the team feels a share."""
+        return self.cost_limit / self.runs[0].settings.get("cost_seen", 1.0)
+
+    @property
+    def label(self) -> str:
+        """The method, and what sets it apart."""
+        return " ".join(filter(None, (self.method, self.settings)))
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of all runs."""
+        return tuple(seed for run in self.runs for seed in run.seeds)
+
+    def final(self, name: str) -> np.ndarray | None:
+        """[S] a metric's means over the last tenth of each run's steps; None where a run does not know it."""
+        found = [run.final(name) for run in self.runs]
+        known = [x for x in found if x is not None]
+        return np.concatenate(known) if len(known) == len(found) else None
+
+
+def groups(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
+    """Pools runs that are the same up to seeds, in the order given.
+
+    Args:
+      note: told of a run whose seeds a longer one has too, which is then left out; where None, this is an error.
+
+    Raises:
+      UsageError: a seed counts twice.
+    """
+    alike: dict[str, list[RunLog]] = {}
+    for log in logs:
+        alike.setdefault(log.identity, []).append(log)
+    pooled = [_without_repeats(runs, note) for runs in alike.values()]
+    return [Group(tuple(runs), _differing(runs[0], [others[0] for others in pooled])) for runs in pooled]
+
+
+def _without_repeats(runs: Sequence[RunLog], note: Say | None) -> list[RunLog]:
+    kept: list[RunLog] = []
+    for run in runs if note is None else sorted(runs, key=lambda run: -run.steps[-1]):
+        twice = [(seed, other) for other in kept for seed in run.seeds if seed in other.seeds]
+        if twice and note is None:
+            seed, other = twice[0]
+            both = f"{other.folder} and {run.folder}"
+            raise UsageError(f"seed {seed} counts twice: {both} are the same run; leave one of them out")
+        if twice and note is not None:
+            note(f"left out: {run.folder} has settings and seeds of {twice[0][1].folder}")
+        else:
+            kept.append(run)
+    return [run for run in runs if run in kept]
+
+
+def _differing(run: RunLog, others: Iterable[RunLog]) -> str:
+    """The settings of `run` that others of its task and method have otherwise, or else its folder's name."""
+    rivals = [other for other in others if (other.task, other.method) == (run.task, run.method)]
+    names = sorted({name for rival in rivals for name in rival.settings if name not in NOT_LEARNING})
+    differing = [name for name in names if len({repr(rival.settings.get(name)) for rival in rivals}) > 1]
+    if len(rivals) > 1 and not differing:
+        return run.folder.name
+    return " ".join(f"{name}={plain(run.settings.get(name, 'default'))}" for name in differing)
+
+
+def plain(value: Any) -> str:
+    """A setting's value, numbers as short as they can be."""
+    if isinstance(value, tuple):
+        return ",".join(map(plain, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)

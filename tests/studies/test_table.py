@@ -1,0 +1,171 @@
+"""Tables of runs: what stands in them is what the runs did."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from by_hand import made
+from pmt_jax.studies import statistics
+from pmt_jax.studies.rows import Row
+
+
+def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "lane", "mappo_l", {0: [1, 1], 1: [2, 1], 2: [3, 0.5]})
+    made(tmp_path / "b", "lane", "f4sg", {0: [1, 0], 1: [8, 0]})
+    made(tmp_path / "c", "lane", "f4sg", {5: [2, 0], 6: [3, 0.8]}, seed=5)  # more seeds of the same
+    code, out, _ = cli("table", tmp_path, "--format", "json", "--baseline", "mappo_l")
+    data = {row["method"]: row for row in json.loads(out)["rows"]}
+    assert code == 0 and list(data) == ["mappo_l", "f4sg"]
+    low, high = statistics.mean_interval([1, 2, 3])
+    assert data["mappo_l"]["reward"] == pytest.approx({"iqm": 2, "low": low, "high": high, "mean": 2, "std": 1})
+    assert data["f4sg"]["seeds"] == 4 and data["f4sg"]["reward"]["iqm"] == 2.5  # 1 and 8 are cut off
+    rate = data["f4sg"]["violation rate"]
+    assert rate["iqm"] == rate["low"] == rate["high"] == 0.25 and rate["std"] == 0
+    assert data["f4sg"]["cost"]["low"] == 0  # no interval reaches below what a cost can be
+    assert data["mappo_l"]["within"] == 1 and data["f4sg"]["worst"] == 0.8
+    # 12 pairs: 1 ties with 1; 8 wins 3; 2 wins 1 and ties 1; 3 wins 2 and ties 1.
+    assert data["f4sg"]["better"]["more reward"]["probability"] == 7.5 / 12
+    assert data["f4sg"]["better"]["less cost"]["probability"] == (3 * 3 + 2) / 12  # less cost is better
+    assert data["mappo_l"]["better"] is None
+
+
+def test_a_table_says_who_left_the_corridor(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "ant_2x4", "happo", {0: [1, 1]}, **{"info/outside": 0.5})
+    made(tmp_path / "b", "lane", "happo", {0: [1, 1]})
+    assert "outside: share of steps beyond a wall" in cli("table", tmp_path / "a")[1]
+    head, _, ant, lane = cli("table", tmp_path)[1].splitlines()[:4]
+    place = head.index("outside")
+    assert ant[place:].startswith("0.5 [-] ") and lane[place:].startswith("- ")
+    assert "outside" not in cli("table", tmp_path / "b")[1]
+
+
+def test_settings_that_differ_make_rows_of_their_own(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "lane", "happo", {0: [1, 1]}, clip=0.1)
+    made(tmp_path / "b", "lane", "happo", {0: [2, 2]}, clip=0.2)
+    code, out, _ = cli("table", tmp_path / "a", tmp_path / "b")
+    assert code == 0 and "happo clip=0.1" in out and "happo clip=0.2" in out
+    assert "'happo' means several rows of lane" in cli("table", tmp_path, "--baseline", "happo")[2]
+    assert cli("table", tmp_path, "--baseline", "happo clip=0.1")[0] == 0
+    made(tmp_path / "c", "lane", "happo", {0: [3, 3]}, clip=0.2)
+    assert "seed 0 counts twice" in cli("table", tmp_path)[2]
+
+
+def test_figures_come_from_evaluations_where_there_are_any(tmp_path: pathlib.Path, cli):
+    judged = {"eval/episode_reward": 7.0, "eval/episode_cost": 0.5, "eval/violation_rate": 0.125}
+    made(tmp_path / "a", "lane", "happo", {0: [1, 1]}, **judged)
+    made(tmp_path / "b", "lane", "mappo", {0: [1, 1]})
+    text = cli("table", tmp_path)[1]
+    happo, mappo = (next(line for line in text.splitlines() if f" {m} " in line) for m in ("happo", "mappo"))
+    assert happo.split()[4:10] == ["7", "[-]", "0.5", "[-]", "0.125", "[-]"] and mappo.split()[4:6] == ["1", "[-]"]
+    assert "evaluation episodes (mean actions)" in text and "training episodes (sampled actions)" in text
+
+
+def test_a_seed_without_a_figure_shows(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "lane", "happo", {0: [1, 1], 1: [None, None]})
+    made(tmp_path / "b", "lane", "mappo", {0: [1, 1]}, broken="critic/loss of seed 0 is nan")
+    made(tmp_path / "c", "noisy", "happo", {0: [1, 1]})
+    lines = [line.split() for line in cli("table", tmp_path, "--baseline", "mappo")[1].splitlines()[2:5]]
+    assert lines[0][:6] == ["lane", "mappo", "1", "10,000", "-", "-"]
+    assert lines[1][:6] == ["lane", "happo", "2", "10,000", "-", "-"]
+    assert lines[2][:6] == ["noisy", "happo", "1", "10,000", "1", "[-]"]  # a task without the baseline
+
+
+def test_the_papers_numbers_stand_beside_ours_in_every_format(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "ant_2x4", "f4sg", {0: [100, 1]})
+    made(tmp_path / "b", "voltage_33", "happo", {0: [1, 1]}, **{"info/totally_controllable_ratio": 0.5})
+    text = cli("table", tmp_path)[1]
+    ant = next(line for line in text.splitlines() if line.startswith("ant_2x4"))
+    assert ant.endswith("2880.68 ± 106.21  4.02 ± 1.46") and "ant_2x4: Table 1" in text
+    assert "CR" in text and "PL" not in text.splitlines()[0]
+    target = tmp_path / "table.md"
+    code, out, _ = cli("table", tmp_path, "--format", "markdown", "-o", target)
+    assert code == 0 and not out
+    lines = target.read_text().splitlines()
+    assert lines[1] == "|---" * (lines[0].count("|") - 1) + "|" and "| 2880.68 ± 106.21 | 4.02 ± 1.46 |" in lines[2]
+    latex = cli("table", tmp_path, "--format", "latex")[1]
+    assert r"ant\_2x4 & f4sg & 1 & " in latex and latex.rstrip().endswith(r"\end{tabular}")
+
+
+def test_improvement_over_all_tasks_weighs_tasks_alike(tmp_path: pathlib.Path, cli):
+    for task, reward in (("lane", 5), ("noisy", 1)):
+        made(tmp_path / task / "base", task, "mappo_l", {0: [2, 1], 1: [3, 1]})
+        made(tmp_path / task / "ours", task, "f4sg", {0: [reward, 1]})
+    text = cli("table", tmp_path, "--baseline", "mappo_l")[1]
+    assert "All tasks together, f4sg: P(more reward) 0.5 [" in text and ", P(less cost) 0.5 [" in text
+
+
+def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
+    assert f"{tmp_path} holds no run" in cli("table", tmp_path)[2]
+    made(tmp_path / "a", "lane", "happo", {0: [1, 1]})
+    assert "unknown format 'html'" in cli("table", tmp_path, "--format", "html")[2]
+    assert "no row is called 'mappo'; did you mean 'happo'?" in cli("table", tmp_path, "--baseline", "mappo")[2]
+    assert "cannot write" in cli("table", tmp_path, "-o", tmp_path / "a" / "config.toml" / "where")[2]
+    assert "name a row with --baseline" in cli("table", tmp_path, "--test")[2]
+
+
+def test_the_best_row_is_the_one_with_most_reward_within_the_limit():
+    def row(reward: float, cost: float) -> Row:
+        scores = {"reward": np.array([reward]), "cost": np.array([cost])}
+        return Row("lane", "happo", "", 1.0, 1, "training", scores)
+
+    best = [row(2, 1.0), row(1, 0.0), row(9, 1.5), row(5, 3.0), row(np.nan, np.nan)]
+    shuffled = [best[i] for i in (4, 2, 0, 3, 1)]
+    assert sorted(shuffled, key=lambda r: r.rank) == best
+
+
+def test_seeds_beyond_the_limit_show(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "lane", "happo", {0: [1, 0.5], 1: [1, 1.0], 2: [1, 4.25], 3: [1, 0]})
+    made(tmp_path / "b", "lane", "mappo", {0: [1, 0.5], 1: [None, None]})
+    text = cli("table", tmp_path)[1]
+    mappo, happo = (line.split() for line in text.splitlines()[2:4])
+    assert happo[-2:] == ["3/4", "4.25"] and mappo[-2:] == ["1/2", "-"]  # a seed without a cost keeps no limit
+    assert "seeds within: seeds whose cost is within it" in text
+
+
+def test_true_costs_show_where_not_all_are_felt(tmp_path: pathlib.Path, cli):
+    true = {"true_episode_cost": 5.0, "true_violation_rate": 0.25, "true_step_cost": 0.2}
+    made(tmp_path / "felt", "lane", "mappo_l", {0: [1, 5.0]}, **true)
+    assert "true" not in cli("table", tmp_path / "felt")[1]
+    true["true_violation_rate"] = 0.5
+    made(tmp_path / "seldom", "lane", "f4sg", {0: [1, 0.5], 1: [2, 0.4]}, cost_seen=0.1, **true)
+    code, out, _ = cli("table", tmp_path, "--format", "json", "--baseline", "mappo_l")
+    row = {row["method"]: row for row in json.loads(out)["rows"]}["f4sg"]
+    assert code == 0 and row["true cost"]["iqm"] == 5 and row["true step cost"]["iqm"] == 0.2
+    assert row["within"] == 1 and row["worst"] == 5  # the limit on what is felt is 1, a tenth of 10
+    assert row["better"]["less true cost"]["probability"] == 0.5
+
+
+def test_tests_against_the_baseline_are_corrected_for_their_number(tmp_path: pathlib.Path, cli):
+    scores = {"mappo_l": range(5), "f4sg": range(10, 15), "r4sg": [-1, 1.5, 2.5, 3.5, 6]}
+    for method, values in scores.items():
+        made(tmp_path / method, "lane", method, {i: [x, 0.1 * x**2] for i, x in enumerate(values)})
+    code, out, _ = cli("table", tmp_path, "--format", "json", "--baseline", "mappo_l", "--test")
+    rows = {row["method"]: row for row in json.loads(out)["rows"]}
+    raw = {method: scipy.stats.mannwhitneyu(scores[method], scores["mappo_l"]).pvalue for method in ("f4sg", "r4sg")}
+    assert code == 0 and raw["f4sg"] == pytest.approx(2 / 252) and raw["r4sg"] > 0.5
+    assert rows["f4sg"]["p"]["more reward"] == pytest.approx(2 * raw["f4sg"])  # the smaller of two
+    assert rows["r4sg"]["p"]["more reward"] == pytest.approx(raw["r4sg"])
+    assert rows["mappo_l"]["p"] is None
+    text = cli("table", tmp_path, "--baseline", "mappo_l", "--test")[1]
+    assert "p (more reward)" in text and " 0.016 " in text and "Holm's correction" in text
+    assert "p (" not in cli("table", tmp_path, "--baseline", "mappo_l")[1]
+
+
+def test_a_table_is_written_whole_or_not_at_all(tmp_path: pathlib.Path, cli, monkeypatch):
+    made(tmp_path / "a", "lane", "happo", {0: [1, 1]})
+    target = tmp_path / "table.txt"
+    target.write_text("before")
+
+    def full(path: pathlib.Path, text: str) -> None:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pathlib.Path, "write_text", full)
+        assert "No space left on device" in cli("table", tmp_path, "-o", target)[2]
+    assert target.read_text() == "before" and len(list(tmp_path.iterdir())) == 2
