@@ -15,11 +15,17 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import numbers
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import jax
 import numpy as np
+
+from .errors import TaskError
+
+_NAME = re.compile(r"\w[\w+-]*(\.[\w+-]+)*")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +33,7 @@ class EnvSpec:
     """The static facts of a task.
 
     Attributes:
-      name: the task's name, as `envs.make` takes it.
+      name: the task's name, as `envs.make` takes it; folders of runs are named after it.
       num_agents: N.
       obs_dim: O, length of one agent's observation (padded to the longest).
       action_dim: A, length of one agent's action (padded to the longest).
@@ -48,6 +54,25 @@ class EnvSpec:
     horizon: int
     action_mask: np.ndarray
     cost_limit: float | tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Refuses facts that no task can have.
+
+        Raises:
+          TaskError: the first such fact.
+        """
+        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
+            raise TaskError(f"spec.name names folders: letters, digits, '_', '-', '+' and '.' only, not {self.name!r}")
+        for name in ("num_agents", "obs_dim", "action_dim", "state_dim", "num_costs", "horizon"):
+            value = getattr(self, name)
+            if not isinstance(value, numbers.Integral) or value < 1:
+                raise TaskError(f"spec.{name} must be a whole number of at least 1, not {value!r}")
+        shape = (self.num_agents, self.action_dim)
+        if np.shape(self.action_mask) != shape or not np.isin(self.action_mask, (0, 1)).all():
+            found = f"an array of shape {np.shape(self.action_mask)}"
+            raise TaskError(f"spec.action_mask must hold 0 and 1 in shape {shape} (agents, actions), not {found}")
+        if not isinstance(self.cost_limit, numbers.Real) or not self.cost_limit >= 0:
+            raise TaskError(f"spec.cost_limit must be a number of at least 0, not {self.cost_limit!r}")
 
 
 @jax.tree_util.register_dataclass

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .base import EnvSpec, State
-from .errors import TaskError
+from .errors import at_least, typed
 
 HORIZON = 25
 ACTION_DIM = 2
@@ -45,10 +45,10 @@ class Lane:
     cost_limit = 1.0
     engine = "xla"
 
+    @typed
     def __init__(self, num_agents: int = 2) -> None:
         """`num_agents` other than 2 gives a task of the same kind whose optimum is not in the table."""
-        if num_agents < 1:
-            raise TaskError(f"num_agents must be at least 1, not {num_agents}")
+        at_least("num_agents", num_agents, 1)
         self.spec = EnvSpec(
             name=self.name,
             num_agents=num_agents,

@@ -20,7 +20,9 @@ from typing import TYPE_CHECKING, Any
 from .errors import TaskError, did_you_mean
 
 if TYPE_CHECKING:
-    from .base import Env
+    import jax
+
+    from .base import Env, EnvSpec
 
 _NAME = re.compile(r"(.*\.py)(?::(\w+))?")
 NEEDS = ("spec", "engine", "reset", "step")  # what training asks of an environment
@@ -94,7 +96,7 @@ def build(make: Callable[..., Any], name: str, options: dict[str, Any]) -> Env:
 
 
 def check(env: Env, name: str) -> None:
-    """Traces one reset and one step of `env` and compares their shapes with its spec.
+    """Checks one reset and two steps of `env` against its spec and the contract.
 
     Raises:
       TaskError: the first thing that differs.
@@ -102,17 +104,13 @@ def check(env: Env, name: str) -> None:
     import jax
     import jax.numpy as jnp
 
-    spec = env.spec
-    n = spec.num_agents
-    action = jnp.zeros((n, spec.action_dim))
+    from .base import EnvSpec
+
+    if not isinstance(env.spec, EnvSpec):
+        raise TaskError(f"{name}: spec must be an EnvSpec of envs/base.py, not a {type(env.spec).__name__}")
     start = _guard(f"{name}: reset fails", lambda: jax.eval_shape(env.reset, jax.random.key(0)))
-    shapes = {"obs": (n, spec.obs_dim), "global_state": (spec.state_dim,), "reward": (), "cost": (n, spec.num_costs)}
-    for field, shape in {**shapes, "terminated": ()}.items():
-        got = getattr(start, field).shape
-        if got != shape:
-            raise TaskError(f"{name}: reset gives {field} of shape {got}, but its spec says {shape}")
-    if start.terminated.dtype != bool:
-        raise TaskError(f"{name}: terminated must be a bool, not {start.terminated.dtype}")
+    _check_fields(env.spec, start, name)
+    action = jnp.zeros(env.spec.action_mask.shape)
     after = _guard(f"{name}: step fails", lambda: jax.eval_shape(env.step, start, action))
     before, then = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (start, after))
     for path in {**before, **then}:
@@ -120,6 +118,60 @@ def check(env: Env, name: str) -> None:
         if old != new:
             where = jax.tree_util.keystr(path)
             raise TaskError(f"{name}: step must keep what reset made, but {where} was {old} and became {new}")
+    if env.engine not in ("mjx", "warp"):  # these take minutes to compile, and training compiles them again
+        _check_values(env, name)
+
+
+def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
+    """Compares the shapes of what `reset` returns with the spec."""
+    n = spec.num_agents
+    shapes = {"obs": (n, spec.obs_dim), "global_state": (spec.state_dim,), "reward": (), "cost": (n, spec.num_costs)}
+    shapes["terminated"] = ()
+    missing = [field for field in (*shapes, "info", "carry") if not hasattr(start, field)]
+    if missing:
+        kind = type(start).__name__
+        raise TaskError(f"{name}: reset must return a State of envs/base.py, but its {kind} has no {missing[0]}")
+    for field, shape in shapes.items():
+        got = getattr(getattr(start, field), "shape", None)
+        if got != shape:
+            raise TaskError(f"{name}: reset gives {field} of shape {got}, but its spec says {shape}")
+    if start.terminated.dtype != bool:
+        raise TaskError(f"{name}: terminated must be a bool, not {start.terminated.dtype}")
+    if not isinstance(start.info, dict):
+        raise TaskError(f"{name}: info must be a dict of scalars, not a {type(start.info).__name__}")
+    for key, value in start.info.items():
+        if getattr(value, "shape", None) != ():
+            raise TaskError(f"{name}: info holds scalars, but '{key}' has shape {getattr(value, 'shape', None)}")
+
+
+def _check_values(env: Env, name: str) -> None:
+    """Plays a reset and two steps, without any action and with the largest in [-1, 1], and looks at their numbers."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    def play(key: jax.Array) -> dict[str, jax.Array]:
+        def step(state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+            after = env.step(state, action)
+            return after, seen(after)
+
+        def seen(state: Any) -> dict[str, jax.Array]:
+            return {field: getattr(state, field) for field in ("obs", "global_state", "reward", "cost")}
+
+        start = env.reset(key)
+        mask = jnp.asarray(env.spec.action_mask, float)
+        later = jax.lax.scan(step, start, jnp.stack([0 * mask, mask]))[1]
+        return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), seen(start), later)
+
+    found = _guard(f"{name}: the first steps fail", lambda: jax.device_get(jax.jit(play)(jax.random.key(0))))
+    for field, values in found.items():
+        if not np.isfinite(values).all():
+            step = int(np.argwhere(~np.isfinite(values))[0][0])
+            when = f"after step {step}" if step else "after reset"
+            raise TaskError(f"{name}: {field} is not finite {when}")
+    low, high = found["cost"].min(), found["cost"].max()
+    if low < 0 or high > 1:
+        raise TaskError(f"{name}: costs must be within [0, 1], but the first steps give {low if low < 0 else high:g}")
 
 
 def _guard(what: str, run: Callable[[], Any]) -> Any:
@@ -127,8 +179,12 @@ def _guard(what: str, run: Callable[[], Any]) -> Any:
     try:
         return run()
     except Exception as error:  # anything can go wrong in a file that we have not written
-        line = traceback.extract_tb(error.__traceback__)[-1]
+        lines = traceback.extract_tb(error.__traceback__)
+        own = [line for line in lines if pathlib.Path(line.filename).parent != pathlib.Path(__file__).parent]
+        line = (own or lines)[-1]
         place = f"{pathlib.Path(line.filename).name}, line {line.lineno}"
+        if isinstance(error, TaskError):
+            raise TaskError(f"{what}: {error} ({place})") from error
         if isinstance(error, SyntaxError):
             place = f"{pathlib.Path(error.filename or '').name}, line {error.lineno}"
         first = (str(error).splitlines() or [""])[0]

@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
-from ..errors import one_of
+from ..errors import one_of, typed
 from ..physics import PhysicsState, make_engine
 
 MODEL = Path(__file__).parent / "ant_corridor.xml"
@@ -89,6 +89,7 @@ class AntCorridor:
       threads: of the `mujoco` engine; all usable CPUs where None.
     """
 
+    @typed
     def __init__(
         self,
         num_agents: int = 2,
@@ -98,6 +99,7 @@ class AntCorridor:
         observation: str = "zscore",
         threads: int | None = None,
     ):
+        one_of("num_agents", str(num_agents), ("2", "4"))
         self._standardise = one_of("observation", observation, ("zscore", "raw")) == "zscore"
         torso = model().body("torso").id
         self._engine = make_engine(

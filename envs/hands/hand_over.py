@@ -38,7 +38,7 @@ import mujoco
 import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
-from ..errors import one_of
+from ..errors import one_of, typed
 from ..physics import PhysicsState, make_engine, resolve
 
 MODEL = Path(__file__).parent / "hand_over.xml"
@@ -153,6 +153,7 @@ class HandOver:
       threads: of the `mujoco` engine; all usable CPUs where None.
     """
 
+    @typed
     def __init__(
         self,
         variant: str = "2x6",

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from ..base import Policy, State
 
@@ -87,21 +88,17 @@ def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: 
         return flow.line_loss_mw + price * jnp.sum(excess)
 
     gradient = jax.grad(objective)
+    adam = optax.adam(optax.polynomial_schedule(0.2, 0.0, 1.5, iterations), b1=0.8, b2=0.95, eps=1e-6)
 
     def policy(state: State) -> jax.Array:
-        def improve(i: jax.Array, c: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-            action, mean, square = c
+        def descend(_: jax.Array, c: tuple[jax.Array, optax.OptState]) -> tuple[jax.Array, optax.OptState]:
+            action, moments = c
             slope = jnp.nan_to_num(gradient(action, state))  # nan where the flow has no solution: stay
-            mean = 0.8 * mean + 0.2 * slope
-            square = 0.95 * square + 0.05 * slope**2
-            correction = jnp.sqrt(1 - 0.95 ** (i + 1.0)) / (1 - 0.8 ** (i + 1.0))
-            rate = 0.2 * (1 - i / iterations) ** 1.5
-            step = rate * correction * mean / (jnp.sqrt(square) + 1e-6)
-            return jnp.clip(action - step.astype(action.dtype), -1.0, 1.0), mean, square
+            step, moments = adam.update(slope, moments)
+            return jnp.clip(action + step, -1.0, 1.0), moments
 
         start = jnp.clip(q_to_action(env, state, state.carry.q), -1.0, 1.0)
-        nothing = jnp.zeros_like(start)
-        return jax.lax.fori_loop(0, iterations, improve, (start, nothing, nothing))[0]
+        return jax.lax.fori_loop(0, iterations, descend, (start, adam.init(start)))[0]
 
     return policy
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base import Declarations, EnvSpec, NetworkMap, State
-from ..errors import TaskError, one_of
+from ..errors import TaskError, at_least, one_of, typed
 from . import power_flow
 from .baselines import POLICIES
 from .layout import layout
@@ -130,6 +131,7 @@ class VoltageControl:
 
     engine = "xla"
 
+    @typed
     def __init__(
         self,
         case: str | Scenario = "case33",
@@ -161,13 +163,15 @@ class VoltageControl:
         self._cost_kind = one_of("cost", cost, COSTS)
         self._cost_scope = one_of("cost_scope", cost_scope, SCOPES)
         self.v_lower, self.v_upper = v_lower, v_upper
+        if not v_lower < v_upper:
+            raise TaskError(f"v_lower must be below v_upper, but {v_lower:g} is not below {v_upper:g}")
         self._first_row = 1 if one_of("timing", timing, ("mapdn", "plain")) == "mapdn" else 0
-        self._history = _at_least("history", history, 1)
-        self._limit = _at_least("episode_limit", episode_limit, 2)
+        self._history = at_least("history", history, 1)
+        self._limit = at_least("episode_limit", episode_limit, 2)
         self._set_network(_blocks(state_space))
         self._set_data(load_profiles(data, scenario.name, scenario.table).scaled(pv_scale, demand_scale))
         self.spec = EnvSpec(
-            name={"case33": "voltage_33", "case141": "voltage_141"}.get(scenario.name, scenario.name),
+            name={"case33": "voltage_33", "case141": "voltage_141"}.get(scenario.name) or _slug(scenario.name),
             num_agents=self.num_agents,
             obs_dim=self._seen.shape[1] * history,
             action_dim=1,
@@ -474,10 +478,9 @@ def _blocks(state_space: str | tuple[str, ...]) -> tuple[str, ...]:
     return tuple(block for block in BLOCKS if block in chosen)
 
 
-def _at_least(name: str, value: int, least: int) -> int:
-    if value < least:
-        raise TaskError(f"{name} must be at least {least}, not {value}")
-    return value
+def _slug(name: str) -> str:
+    """A network's name as a task's, whose name folders bear."""
+    return re.sub(r"\W+", "_", name).strip("_") or "network"
 
 
 def _views(n: int, pv_bus: np.ndarray, zone: np.ndarray, blocks: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -85,6 +85,33 @@ GOOD = EXAMPLE.read_text()
             "step must keep what reset made, but .carry was",
         ),
         (
+            GOOD.replace("return State(", "return dict("),
+            "",
+            "reset must return a State of envs/base.py, but its dict has no obs",
+        ),
+        (
+            GOOD.replace("np.ones((NUM_AGENTS, 1)", "np.ones((NUM_AGENTS, 2)"),
+            "",
+            "spec.action_mask must hold 0 and 1 in",
+        ),
+        (
+            GOOD.replace("cost_limit=2.0", "cost_limit='2'"),
+            "",
+            "spec.cost_limit must be a number of at least 0, not '2'",
+        ),
+        (GOOD.replace("cost_limit=2.0", "cost_limit=-2"), "", "spec.cost_limit must be a number of at least 0, not -2"),
+        (GOOD.replace("horizon=50", "horizon=0"), "", "spec.horizon must be a whole number of at least 1, not 0"),
+        (GOOD.replace("horizon=50", "horizon=-3"), "", "spec.horizon must be a whole number of at least 1, not -3"),
+        (GOOD.replace('name="pole"', 'name="../pole"'), "", "spec.name names folders: letters, digits"),
+        (
+            GOOD.replace('"tilt": jnp.abs(ends[0] - ends[1])', '"tilt": ends'),
+            "",
+            "info holds scalars, but 'tilt' has shape",
+        ),
+        (GOOD.replace("cost=0.0", "cost=1.5"), "", "costs must be within [0, 1], but the first steps give 1.5"),
+        (GOOD.replace("cost=tilt > 0.3", "cost=-1.0"), "", "costs must be within [0, 1], but the first steps give -1"),
+        (GOOD.replace("reward=speed", "reward=speed / 0"), "", "reward is not finite after step 1"),
+        (
             GOOD.replace("ends**2", "endz**2"),
             ":Pole",
             "step fails: NameError: name 'endz' is not defined (env.py, line ",
