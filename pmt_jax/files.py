@@ -1,10 +1,12 @@
-"""Files that are either whole or not there, and rows of figures that may not be."""
+"""Files that are either whole or not there, and the rows of metrics.jsonl."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import pathlib
+import shutil
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,7 +15,7 @@ from .errors import UsageError
 
 @contextlib.contextmanager
 def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A file beside `out` to write to, which takes the place of `out` when all has gone well.
+    """A file beside `out` to write to, which replaces `out` when all has gone well.
 
     Raises:
       UsageError: the folder cannot be written.
@@ -30,6 +32,28 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
             partial.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A new folder beside `out` to write to; when all has gone well it becomes `out`, or its files move into it.
+
+    Raises:
+      UsageError: the folder cannot be written.
+    """
+    partial = out.absolute().with_name(f".{out.absolute().name}.partial-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if not out.exists() or not any(out.iterdir()):
+            partial.rename(out)
+        else:
+            for file in partial.iterdir():
+                file.replace(out / file.name)
+    except OSError as error:
+        raise UsageError(f"cannot write into {out}: {error.strerror or error}; choose another folder") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def replace_text(path: pathlib.Path, text: str) -> None:
     """Writes a file whole or, where that fails, leaves the old one."""
     partial = path.with_name(path.name + ".partial")
@@ -38,7 +62,7 @@ def replace_text(path: pathlib.Path, text: str) -> None:
 
 
 def read_rows(metrics: pathlib.Path, missing_ok: bool = True) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl, without lines that are no row, cut off in the middle for one.
+    """The rows of a metrics.jsonl; a line that is not one, as where a write was cut off, is left out.
 
     Raises:
       OSError: it cannot be read; where there is no file and `missing_ok`, there are no rows.

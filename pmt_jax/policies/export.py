@@ -10,12 +10,12 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import UsageError
+from ..files import writing_folder
 from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import Params, RunningMoments
 from . import numpy_policy
-from .load import policy_function, state_of_seed
+from .load import load_seed, policy_function
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
@@ -29,18 +29,15 @@ def export_policy(folder: str | pathlib.Path, out: pathlib.Path, seed: int | Non
     Raises:
       UsageError: as `load_policy`, or `out` cannot be written.
     """
-    setup, state = state_of_seed(folder, seed, which)
+    setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
     spec = setup.vector.spec
     batch = jax.export.symbolic_shape(f"batch, {spec.num_agents}, {spec.obs_dim}")
     program = jax.jit(jax.vmap(policy_function(setup, state)))
     exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(batch, jnp.float32))
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "policy.stablehlo").write_bytes(exported.serialize())
-        np.savez(out / "policy.npz", **weights(setup, state.actor.params, state.obs_moments))  # pyright: ignore[reportArgumentType] (its stub)
-        (out / "numpy_policy.py").write_text(inspect.getsource(numpy_policy))
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another folder") from None
+    with writing_folder(out) as partial:
+        (partial / "policy.stablehlo").write_bytes(exported.serialize())
+        np.savez(partial / "policy.npz", **weights(setup, state.actor.params, state.obs_moments))  # pyright: ignore[reportArgumentType] (its stub)
+        (partial / "numpy_policy.py").write_text(inspect.getsource(numpy_policy))
 
 
 def weights(setup: Setup, params: Params, moments: RunningMoments) -> dict[str, np.ndarray]:

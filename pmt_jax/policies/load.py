@@ -33,7 +33,7 @@ def load_run(
       folder: the run folder, or the name of a pretrained policy, of which there is but what acts of one seed.
       which: `last`, or `best`: each seed's own best (see docs/runs.md).
       physics: an engine other than the run's.
-      warn: told of damaged checkpoints, which are passed over.
+      warn: called with a sentence for each damaged checkpoint, which is passed over.
 
     Raises:
       UsageError: the folder holds no run, or no checkpoint; or there is no such policy.
@@ -61,16 +61,24 @@ def load_policy(folder: str | pathlib.Path, seed: int | None = None, which: str 
     Raises:
       UsageError: no run, no checkpoint, or no such seed.
     """
-    return policy_function(*state_of_seed(folder, seed, which))
+    setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
+    return policy_function(setup, state)
 
 
-def state_of_seed(folder: str | pathlib.Path, seed: int | None, which: str) -> tuple[Setup, ActingState]:
-    setup, states = load_run(pathlib.Path(folder), which, physics="auto")  # nothing will be simulated
+def load_seed(
+    folder: str | pathlib.Path, seed: int | None = None, which: str = "last", physics: str | None = None
+) -> tuple[Setup, int, ActingState]:
+    """A run's setup, one of its seeds (its first if None), and that seed's learner state.
+
+    Raises:
+      UsageError: as `load_run`, or the run has no such seed.
+    """
+    setup, states = load_run(pathlib.Path(folder), which, physics)
     first, count = setup.config.seed, setup.config.seeds
-    index = 0 if seed is None else seed - first
-    if not 0 <= index < count:
-        raise UsageError(f"{folder} holds seeds {first} to {first + count - 1}, not {seed}")
-    return setup, jax.tree.map(lambda x: x[index], states)
+    chosen = first if seed is None else seed
+    if not first <= chosen < first + count:
+        raise UsageError(f"{folder} has no seed {seed}; it has {', '.join(map(str, range(first, first + count)))}")
+    return setup, chosen, jax.tree.map(lambda x: x[chosen - first], states)
 
 
 def policy_function(setup: Setup, state: ActingState) -> Policy:

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
-from ..errors import UsageError
 from ..learning.evaluation import EVALUATION_KEY
 from ..learning.setup import Setup
 from ..learning.types import ActingState
-from ..policies.load import load_run
+from ..policies.load import load_seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,15 +78,9 @@ def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, d
     Raises:
       UsageError: the folder holds no run that can be loaded, or no such seed.
     """
-    setup, state = load_run(folder)
-    first = setup.config.seed
-    seed = first if seed is None else seed
-    if not first <= seed < first + setup.config.seeds:
-        known = ", ".join(str(first + i) for i in range(setup.config.seeds))
-        raise UsageError(f"the run in {folder} has no seed {seed}; it has {known}")
-    one = jax.tree.map(lambda x: x[seed - first], state)
+    setup, seed, state = load_seed(folder, seed)
     program = jax.jit(functools.partial(record, setup, deterministic=deterministic))
-    moments = jax.device_get(program(one, jnp.asarray(number)))
+    moments = jax.device_get(program(state, jnp.asarray(number)))
     return _whole(setup, seed, moments)
 
 

@@ -312,7 +312,7 @@ def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
     np.testing.assert_allclose(jax.jit(jax.vmap(policy))(obs), expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(policy(obs[2]), expected[2], rtol=1e-5, atol=1e-6)
     assert np.abs(np.asarray(load_policy(whole, seed=0)(obs[2]) - expected[2])).max() > 1e-3
-    with pytest.raises(ValueError, match="holds seeds 0 to 1, not 7"):
+    with pytest.raises(ValueError, match="has no seed 7; it has 0, 1"):
         load_policy(whole, seed=7)
 
 

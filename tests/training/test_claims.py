@@ -1,0 +1,114 @@
+"""A run folder belongs to one process at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from pmt_jax import load_config, make_setup
+from pmt_jax.errors import UsageError
+from pmt_jax.training import claims, run_folder
+
+CLAIMS = """
+import pathlib, sys
+from pmt_jax.errors import UsageError
+from pmt_jax.training.claims import claim
+sys.stdin.readline()
+try:
+    with claim(pathlib.Path(sys.argv[1])):
+        print("claimed", flush=True)
+        sys.stdin.read()
+except UsageError as error:
+    print(error, flush=True)
+"""
+
+
+def rivals(folder: pathlib.Path, count: int) -> list[subprocess.Popen[str]]:
+    """Processes that claim `folder` once a line is written to them."""
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-c", CLAIMS, str(folder)]
+    return [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for _ in range(count)]
+
+
+def answers(processes: list[subprocess.Popen[str]]) -> list[str]:
+    for process in processes:
+        assert process.stdin
+        process.stdin.write("\n")
+        process.stdin.flush()
+    return [process.stdout.readline().strip() for process in processes if process.stdout]
+
+
+def test_of_many_that_start_together_one_gets_the_folder(tmp_path: pathlib.Path):
+    processes = rivals(tmp_path, 6)
+    said = answers(processes)
+    assert said.count("claimed") == 1
+    owner = processes[said.index("claimed")]
+    others = [line for line in said if line != "claimed"]
+    assert all(f"{tmp_path} is in use by process" in line and "choose another --out" in line for line in others)
+    with pytest.raises(UsageError, match=f"in use by process {owner.pid} since"), claims.claim(tmp_path):
+        pass
+    owner.send_signal(signal.SIGKILL)
+    owner.wait()
+    with claims.claim(tmp_path):  # the owner is gone, so its claim is
+        assert json.loads((tmp_path / claims.NAME).read_text())["pid"] == os.getpid()
+    assert not list(tmp_path.iterdir())
+    for process in processes:
+        process.communicate()
+
+
+def test_a_claim_of_another_host_stands_until_it_is_deleted(tmp_path: pathlib.Path):
+    file = tmp_path / claims.NAME
+    file.write_text(json.dumps({"pid": 1, "host": "node7", "since": "2026-01-01 00:00:00"}))
+    with (
+        pytest.raises(UsageError, match=f"process 1 on node7 since .*; if that process is gone, delete {file}"),
+        claims.claim(tmp_path),
+    ):
+        pass
+    file.unlink()
+    with claims.claim(tmp_path):
+        assert json.loads(file.read_text())["host"] == socket.gethostname()
+
+
+def test_where_files_cannot_be_locked_the_process_in_the_file_counts(tmp_path: pathlib.Path, monkeypatch):
+    def cannot_lock(*_: object) -> None:
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(claims.fcntl, "flock", cannot_lock)
+    file = tmp_path / claims.NAME
+    owner = {"pid": os.getppid(), "host": socket.gethostname(), "since": "2026-01-01 00:00:00"}
+    file.write_text(json.dumps(owner))
+    with pytest.raises(UsageError, match=f"in use by process {os.getppid()}"), claims.claim(tmp_path):
+        pass
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for stale in (json.dumps(owner | {"pid": gone.pid}), "", "[1]", "{"):
+        file.write_text(stale)
+        with claims.claim(tmp_path):
+            pass
+        assert not file.exists()
+
+
+def test_training_and_resuming_in_a_folder_in_use_is_refused(tmp_path: pathlib.Path, cli):
+    with claims.claim(tmp_path):
+        code, out, err = cli("train", "lane", "--out", tmp_path)
+        assert code == 2 and f"{tmp_path} is in use by process {os.getpid()} since" in err and not out
+        (tmp_path / "config.toml").write_text('task = "lane"\n')
+        assert "is in use by process" in cli("train", "lane", "--out", tmp_path, "--resume")[2]
+    assert [path.name for path in tmp_path.iterdir()] == ["config.toml"]
+
+
+def test_default_folders_differ_and_stay_in_runs(tmp_path: pathlib.Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder.time, "strftime", lambda form: "20260101-000000")
+    setup = make_setup(load_config("lane", method="happo"))
+    names = [run_folder.create(setup).name for _ in range(3)]
+    assert names == [f"lane-happo-20260101-000000{end}" for end in ("", "-2", "-3")]
+    object.__setattr__(setup.vector.env.spec, "name", "../../lane")
+    assert run_folder.create(setup) == pathlib.Path("runs") / "lane-happo-20260101-000000-4"
