@@ -90,15 +90,25 @@ def _read(file: int) -> dict[str, Any]:
 
 def _write(file: int) -> None:
     since = time.strftime("%Y-%m-%d %H:%M:%S")
+    owner = {"pid": os.getpid(), "host": socket.gethostname(), "since": since, "slurm": _slurm_job()}
     os.ftruncate(file, 0)
-    os.pwrite(file, json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
+    os.pwrite(file, json.dumps(owner).encode(), 0)
     os.fsync(file)
+
+
+def _slurm_job() -> list[str] | None:
+    """The job's number and how often SLURM has started it again."""
+    job = os.environ.get("SLURM_JOB_ID")
+    return None if job is None else [job, os.environ.get("SLURM_RESTART_COUNT", "0")]
 
 
 def _may_be_alive(owner: dict[str, Any], locked: bool) -> bool:
     """Whether the owner may still be at work, although this process could open its file and perhaps lock it."""
     if not owner:
         return False
+    theirs, ours = owner.get("slurm"), _slurm_job()
+    if theirs and ours and theirs[0] == ours[0] and theirs[1] != ours[1]:
+        return False  # the same job, which SLURM has started again, perhaps on another host
     if owner.get("host") != socket.gethostname():
         return True
     try:

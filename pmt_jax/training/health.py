@@ -60,13 +60,12 @@ def _cause(setup: Setup, index: int, share: float) -> str:
 
 
 def _extreme_settings(setup: Setup, index: int) -> dict[str, float]:
-    """The seed's settings that overflow or divide by zero."""
+    """The seed's settings that overflow in single precision."""
     hyper = jax.device_get(setup.vmap_arguments[0])
     values = {name: np.asarray(getattr(hyper, name)) for name in HYPER_FIELDS if name != "cost_limit"}
     own = {name: float(x[index] if x.ndim else x) for name, x in values.items()}
-    found = {name: x for name, x in own.items() if math.isfinite(x) and x > (1.0 if name.endswith("_lr") else 1e6)}
-    found = {name: x for name, x in found.items() if name != "lr_half_life"}
-    return found | {name: x for name, x in own.items() if name == "temperature" and x < 1e-6}
+    usual = {name: 1.0 if name.endswith("_lr") else 1e6 for name in own} | {"lr_half_life": math.inf}
+    return {name: x for name, x in own.items() if usual[name] < x < math.inf}
 
 
 def _divergence(row: Row, where: str) -> str | None:

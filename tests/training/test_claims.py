@@ -76,6 +76,17 @@ def test_a_claim_of_another_host_stands_until_it_is_deleted(tmp_path: pathlib.Pa
         assert json.loads(file.read_text())["host"] == socket.gethostname()
 
 
+def test_a_job_that_slurm_starts_again_takes_its_folder_over(tmp_path: pathlib.Path, monkeypatch):
+    file = tmp_path / claims.NAME
+    monkeypatch.setenv("SLURM_JOB_ID", "77")
+    file.write_text(json.dumps({"pid": 1, "host": "node7", "slurm": ["77", "0"]}))
+    with pytest.raises(UsageError, match="process 1 on node7"), claims.claim(tmp_path):
+        pass
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    with claims.claim(tmp_path):
+        assert json.loads(file.read_text())["slurm"] == ["77", "1"]
+
+
 def test_where_files_cannot_be_locked_the_process_in_the_file_counts(tmp_path: pathlib.Path, monkeypatch):
     def cannot_lock(*_: object) -> None:
         raise OSError(38, "Function not implemented")

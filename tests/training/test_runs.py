@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import pathlib
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,6 +19,7 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
+from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
 
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.cli import doctor
@@ -29,63 +29,6 @@ from pmt_jax.learning.maths import running_moments
 from pmt_jax.policies import load, numpy_policy
 from pmt_jax.policies.export import weights
 from pmt_jax.training import checkpoint, loggers, trainer
-
-STEPS = 1600
-TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
-ARGUMENTS = ("lane", *TINY, "--seeds", 2, "--eval-interval", 4, "--eval-episodes", 4, "--no-cache")
-
-
-def rows(out: pathlib.Path) -> list[dict]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-
-
-def saved(out: pathlib.Path) -> dict[str, np.ndarray]:
-    """The whole content of a run's newest checkpoint: last and best."""
-    states = [checkpoint.pack(load.load_run(out, which)[1]) for which in ("last", "best")]
-    return {f"{i}{path}": x for i, state in enumerate(states) for path, x in state.items()}
-
-
-def assert_same_run(out: pathlib.Path, other: pathlib.Path) -> None:
-    ours, theirs = ([{**row, "seconds": 0} for row in rows(folder)] for folder in (out, other))
-    assert ours == theirs
-    first, second = saved(out), saved(other)
-    assert first.keys() == second.keys()
-    assert all(np.array_equal(first[path], second[path]) for path in first)
-
-
-@pytest.fixture(scope="session")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """A run of two seeds that nothing befell, with the checkpoints of its last two chunks."""
-    from pmt_jax.cli import main
-
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
-        assert main([str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)]) == 0
-    return out
-
-
-@pytest.fixture
-def copy(whole: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
-    """A copy of that run, to be damaged."""
-    return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
-
-
-@pytest.fixture
-def small_disk(tmp_path: pathlib.Path):
-    """A file system of 160 kB, room for two checkpoints, and a function that mounts it anew with other options."""
-    place = tmp_path / "disk"
-    place.mkdir()
-
-    def mount(options: str) -> bool:
-        command = ["mount", "-t", "tmpfs", "-o", options, "none", str(place)]
-        return subprocess.run(command, capture_output=True).returncode == 0
-
-    if not shutil.which("mount") or not mount("size=160k"):
-        pytest.skip("may not mount a file system here")
-    yield place, lambda options: mount(f"remount,{options}")
-    subprocess.run(["umount", "-l", str(place)], check=True)
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Resuming
@@ -115,11 +58,7 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
 ):
     out = tmp_path / "killed"
     arguments = [str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)]
-    environment = os.environ | {
-        "JAX_PLATFORMS": "cpu",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
-    }
-    process = subprocess.run([sys.executable, "-c", DIES, *arguments], env=environment, capture_output=True)
+    process = subprocess.run([sys.executable, "-c", DIES, *arguments], env=environment(), capture_output=True)
     assert process.returncode == -signal.SIGKILL
     assert {p.name for p in (out / "checkpoints").iterdir()} == {"400", "600", "800.orbax-checkpoint-tmp"}
     assert rows(out)[-1]["step"] == 800
@@ -130,18 +69,19 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
     assert not list((out / "checkpoints").glob("*tmp"))
 
 
-def test_sigterm_saves_and_says_how_to_go_on(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_saves_and_the_command_continues(
+    number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
+):
     write = loggers.Jsonl.write
-    monkeypatch.setattr(
-        loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(signal.SIGTERM))
-    )
-    out = tmp_path / "term"
+    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(number)))
+    out = tmp_path / "a b"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
-    assert code == 128 + signal.SIGTERM
+    assert code == 128 + number and not (out / ".claim").exists()
     command = re.search(r"interrupted after 200 steps; saved. Continue with: pmt (.*)", text)
     assert command and [p.name for p in (out / "checkpoints").iterdir()] == ["200"]
     monkeypatch.undo()
-    assert cli(*command[1].split())[0] == 0
+    assert cli(*shlex.split(command[1]))[0] == 0
     assert_same_run(out, whole)
 
 
@@ -181,13 +121,16 @@ def test_a_damaged_checkpoint_is_noticed_and_the_one_before_taken(whole: pathlib
 
 
 def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
-    """Killed before its first checkpoint, and versions.json gone: the run starts over, rows and all."""
+    """Without checkpoints and versions.json the run starts over, and what it had logged is kept."""
+    before = (copy / "metrics.jsonl").read_text()
     shutil.rmtree(copy / "checkpoints")
     (copy / "versions.json").unlink()
     code, _, err = cli("eval", copy)
     assert code == 2 and "there is no finished checkpoint" in err
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
     assert code == 0 and "versions.json cannot be read" in text and "resuming after 0 steps" in text
+    assert "its rows so far are kept in metrics-before-1.jsonl" in text
+    assert (copy / "metrics-before-1.jsonl").read_text() == before
     assert_same_run(copy, whole)
 
 
@@ -215,6 +158,22 @@ def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli
     assert f"{metrics} ends at step 800, but the checkpoint is of step 1,600: the rows between are lost" in text
     steps = [row["step"] for row in rows(copy)]
     assert steps[-1] == STEPS + 200 and 1000 not in steps
+
+
+def test_fewer_steps_than_are_done_change_nothing(copy: pathlib.Path, cli):
+    before = {path.name: path.read_bytes() for path in copy.glob("*.*")}
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", 400, "--out", copy, "--resume")
+    assert code == 0 and "done: 1,600 steps" in text
+    assert {path.name: path.read_bytes() for path in copy.glob("*.*")} == before
+
+
+@pytest.mark.parametrize("row", ['{"step": "many"}', '{"seed": 0}', '{"step": 200, "seed": 0, "seconds": null}'])
+def test_a_row_that_is_none_of_a_run(row: str, copy: pathlib.Path, cli):
+    metrics = copy / "metrics.jsonl"
+    metrics.write_text(before := metrics.read_text() + row + "\n")
+    code, _, err = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    assert code == 2 and f"{metrics} holds a row with" in err and "delete that line" in err and err.count("\n") == 1
+    assert metrics.read_text() == before and not (copy / ".claim").exists()
 
 
 def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
@@ -352,41 +311,7 @@ def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pat
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Sinks, profile, doctor
-
-
-def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
-    pytest.importorskip("tensorboardX")
-    out = tmp_path / "run"
-    arguments = ("train", *ARGUMENTS, "--out", out, "--sink", "csv,tensorboard")
-    assert cli(*arguments, "--steps", 400)[0] == 0
-    assert cli(*arguments, "--steps", STEPS, "--resume", "--profile", tmp_path / "trace")[0] == 0
-    with (out / "metrics.csv").open(newline="") as file:
-        table = list(csv.DictReader(file))
-    assert len(table) == len(rows(out))
-    for ours, theirs in zip(table, rows(out), strict=True):
-        assert ours == {name: "" if x is None else str(x) for name, x in theirs.items()}
-    assert sorted(p.name for p in (out / "tensorboard").iterdir()) == ["seed0", "seed1"]
-    assert list((tmp_path / "trace").rglob("*.xplane.pb"))
-    assert_same_run(out, whole)
-
-
-def test_weights_and_biases_without_a_network(tmp_path: pathlib.Path, cli, monkeypatch):
-    pytest.importorskip("wandb")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--steps", 400, "--out", out, "--sink", "wandb")[0] == 0
-    identity = (out / "wandb-id").read_text()
-    assert len(list((out / "wandb").glob(f"offline-run-*-{identity}"))) == 1
-
-
-def test_sinks_that_are_not_there(tmp_path: pathlib.Path, cli, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    code, _, err = cli("train", "lane", "--sink", "csv,wandb", "--out", tmp_path / "x")
-    assert code == 2 and err == "pmt: sink 'wandb' needs wandb; install it with pip install 'pmt-jax[log]'\n"
-    assert "unknown sink 'tensorbord'; did you mean 'tensorboard'?" in cli("train", "lane", "--sink", "tensorbord")[2]
-    assert not (tmp_path / "x").exists()
+# Doctor
 
 
 def test_doctor(cli, monkeypatch):

@@ -1,0 +1,43 @@
+"""A run of two seeds, 16 updates, that trains in a second; what its folder holds."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+
+import jax
+import numpy as np
+
+from pmt_jax.policies import load
+from pmt_jax.training import checkpoint
+
+STEPS = 1600
+TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
+ARGUMENTS = ("lane", *TINY, "--seeds", 2, "--eval-interval", 4, "--eval-episodes", 4, "--no-cache")
+
+
+def rows(out: pathlib.Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def saved(out: pathlib.Path) -> dict[str, np.ndarray]:
+    """The whole content of a run's newest checkpoint: last and best."""
+    states = [checkpoint.pack(load.load_run(out, which)[1]) for which in ("last", "best")]
+    return {f"{i}{path}": x for i, state in enumerate(states) for path, x in state.items()}
+
+
+def assert_same_run(out: pathlib.Path, other: pathlib.Path) -> None:
+    ours, theirs = ([{**row, "seconds": 0} for row in rows(folder)] for folder in (out, other))
+    assert ours == theirs
+    first, second = saved(out), saved(other)
+    assert first.keys() == second.keys()
+    assert all(np.array_equal(first[path], second[path]) for path in first)
+
+
+def environment() -> dict[str, str]:
+    """For processes that train on the CPU with the tests' compile cache."""
+    return os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
+    }

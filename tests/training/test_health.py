@@ -1,0 +1,123 @@
+"""A seed that breaks stops no other, keeps what it had learned, and the cause is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pathlib
+import shutil
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from runs import ARGUMENTS, STEPS, rows, saved
+
+from pmt_jax import load_config, make_setup
+from pmt_jax.training import health, trainer
+from pmt_jax.training.metrics import LOSSES
+
+
+def breaking(monkeypatch: pytest.MonkeyPatch, updates: dict[int, int]) -> None:
+    """Training in which a weight of seed i becomes nan with update number updates[i]."""
+    compile_run = trainer.compile_run
+
+    def compile_breaking(*arguments: Any) -> Any:
+        state, programs = compile_run(*arguments)
+
+        def chunk(state: Any) -> Any:
+            state, metrics = programs.chunk(state)
+            bad = np.array([updates.get(i, 10**9) <= n for i, n in enumerate(np.asarray(state.update))])
+            params = jax.tree.map(
+                lambda x: jnp.where(bad.reshape(-1, *[1] * (x.ndim - 1)), jnp.nan, x), state.actor.params
+            )
+            state = dataclasses.replace(state, actor=dataclasses.replace(state.actor, params=params))
+            return state, metrics | {"finite": ~bad}
+
+        return state, programs._replace(chunk=chunk)
+
+    monkeypatch.setattr(trainer, "compile_run", compile_breaking)
+
+
+def test_one_seed_breaks_and_the_other_trains_on(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
+    breaking(monkeypatch, {1: 10})
+    out = tmp_path / "run"
+    command = ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
+    code, text, err = cli(*command)
+    assert (
+        code == 1 and not err and "stopped: a weight of seed 1 at step 1,000 is not finite; training diverged" in text
+    )
+    assert f"seed(s) 1 broke; the last finite state and the best of every seed are saved in {out}" in text
+
+    ours, theirs = ([row | {"seconds": 0} for row in rows(folder)] for folder in (out, whole))
+    assert ours[0::2] == theirs[0::2]  # seed 0
+    assert ours[1:9:2] == theirs[1:9:2]  # seed 1 before it broke
+    assert all(row["broken"].startswith("a weight of seed 1") for row in ours[9::2])
+    assert ours[9]["critic/loss"] == theirs[9]["critic/loss"] and ours[11]["critic/loss"] is None
+    first, second = saved(out), saved(whole)
+    for path, x in first.items():
+        assert np.isfinite(x).all() or not np.isfinite(second[path]).all()  # an unknown best cost is inf
+        assert np.array_equal(x[0], second[path][0])
+    assert first["0.update"].tolist() == [16, 8]
+
+    code, again, _ = cli(*command, "--resume")
+    assert code == 1 and "stopped: a weight of seed 1 at step 1,000" in again
+    shutil.rmtree(out / "checkpoints" / str(STEPS))
+
+
+def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypatch):
+    breaking(monkeypatch, {0: 3, 1: 5})
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
+    assert code == 1 and "seed 0 at step 400" in text and "seed 1 at step 600" in text and "done" not in text
+    assert rows(tmp_path / "run")[-1]["step"] == 600
+    assert saved(tmp_path / "run")["0.update"].tolist() == [2, 4]
+
+
+def row(**changes: float) -> dict[str, Any]:
+    """A row of a seed that is well, but for `changes`; `/` is written `__`."""
+    well = dict.fromkeys(LOSSES, 0.5) | {"step": 100, "seed": 3, "task": "lane", "non_finite": 0}
+    well |= {"step_reward": 0.1, "step_cost": 0.1}
+    well |= {f"{c}/return_{m}": 5.0 for c in ("critic", "cost_critic") for m in ("mean", "std")}
+    return well | {name.replace("__", "/"): x for name, x in changes.items()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "says"),
+    [
+        ({}, {}, None),
+        ({"non_finite": 51}, {}, "51% of the environment steps of seed 3 at step 100 were not finite; check the obs"),
+        ({"non_finite": 40}, {}, None),
+        ({"non_finite": 40, "actor__loss": math.nan}, {}, "40.0% of the environment steps were not finite: check"),
+        ({"actor__loss": math.inf}, {}, "actor/loss of seed 3 at step 100 is inf; training diverged: try smaller lea"),
+        ({"critic__loss": math.nan}, {"critic_lr": 1e38}, "single precision cannot train with critic_lr = 1e+38"),
+        ({"critic__loss": math.nan}, {"lambda_max": 1e38}, "single precision cannot train with lambda_max = 1e+38"),
+        ({"critic__return_std": 2e8}, {}, "the critic of seed 3 at step 100 diverged: its returns are 5 +- 2e+08 rewa"),
+        ({"critic__return_std": 2e8, "step_reward": -1e7}, {}, None),
+        ({"cost_critic__return_mean": -2e8}, {}, "the cost_critic of seed 3 at step 100 diverged"),
+    ],
+)
+def test_the_cause_is_told_apart(changes: dict[str, float], settings: dict[str, float], says: str | None):
+    setup = make_setup(load_config("lane", num_envs=4, rollout_length=25, minibatches=1, log_interval=1, **settings))
+    found = health.diagnose(setup, 0, row(**changes), finite=True)
+    assert found is None if says is None else says in str(found)
+
+
+NAN_REWARDS = """
+import dataclasses
+from envs.toys import Lane
+
+class Broken(Lane):
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, reward=after.reward * float("nan"))
+"""
+
+
+def test_a_task_whose_reward_is_never_finite_stops(tmp_path: pathlib.Path, cli):
+    file = tmp_path / "broken.py"
+    file.write_text(NAN_REWARDS)
+    sizes = ("--num-envs", 4, "--rollout-length", 25, "--hidden", 8, "--minibatches", 1, "--epochs", 1)
+    code, text, err = cli("train", file, *sizes, "--steps", 1000, "--out", tmp_path / "run", "--no-cache")
+    assert code == 1 and not err
+    assert "stopped: 100% of the environment steps of seed 0 at step 100 were not finite; check the obs" in text

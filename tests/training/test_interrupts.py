@@ -1,0 +1,74 @@
+"""Ctrl-C, SIGTERM, SIGHUP and closed pipes: answered at once while nothing is trained, and nothing trained is lost."""
+
+from __future__ import annotations
+
+import pathlib
+import shlex
+import signal
+import subprocess
+import sys
+
+import pytest
+from runs import ARGUMENTS, STEPS, assert_same_run, environment
+
+BUSY = """
+import hashlib, signal, sys
+from pmt_jax.cli import main
+from pmt_jax.training import trainer
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
+compile_run, compiles = trainer.compile_run, sys.argv[1] == "compiling"
+
+def in_native_code(*_):
+    print("busy", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # minutes, in which no Python of this thread runs
+
+def compile_slowly(setup, say):
+    if compiles:
+        in_native_code()
+    state, programs = compile_run(setup, say)
+    return state, programs._replace(chunk=in_native_code)
+
+trainer.compile_run = compile_slowly
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def busy(phase: str, out: pathlib.Path) -> subprocess.Popen[str]:
+    """A run that is busy in native code, while it compiles or trains."""
+    words = [str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)]
+    command = [sys.executable, "-c", BUSY, phase, *words]
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout and any(line == "busy\n" for line in process.stdout)
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_it_compiles_ends_the_run_at_once(number: int, tmp_path: pathlib.Path):
+    process = busy("compiling", tmp_path)
+    process.send_signal(number)
+    text, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + number and not err
+    assert text == "interrupted: nothing new was trained yet\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_twice_in_a_long_chunk_ends_the_run_at_once(tmp_path: pathlib.Path):
+    process = busy("training", tmp_path)
+    assert process.stdout
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == (
+        "interrupted: saving after the running chunk; Ctrl-C again ends at once, without saving\n"
+    )
+    process.send_signal(signal.SIGINT)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and text == "interrupted: what was not saved is lost\n"
+    assert not (tmp_path / ".claim").exists()
+
+
+def test_a_closed_pipe_silences_the_output_and_training_continues(whole: pathlib.Path, tmp_path: pathlib.Path):
+    words = ["train", *map(str, ARGUMENTS), "--steps", str(STEPS), "--out", str(tmp_path / "run")]
+    command = f"{sys.executable} -m pmt_jax {shlex.join(words)} | head -2; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], env=environment(), capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr and done.stdout.count("\n") == 2
+    assert_same_run(tmp_path / "run", whole)
