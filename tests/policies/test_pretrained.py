@@ -147,7 +147,9 @@ def test_what_is_told_about_them_and_how_large_they_are():
 def test_they_come_with_the_wheel():
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "pmt_jax.policies.pretrained" in table["packages"]
-    inside = {file for pattern in table["package-data"]["pmt_jax.policies.pretrained"] for file in hub.FOLDER.glob(pattern)}
+    inside = {
+        file for pattern in table["package-data"]["pmt_jax.policies.pretrained"] for file in hub.FOLDER.glob(pattern)
+    }
     assert inside >= {hub.file_of(name) for name in NAMES}
 
 
