@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A point in the space of methods (specification, section 7).
+    """One method: its choice for each switch of the learner.
 
     Attributes:
       order: `simultaneous` updates all agents at once; `sequential` updates them one after the other in random order,

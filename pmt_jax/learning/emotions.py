@@ -57,7 +57,9 @@ def divergence(
 def appraisal_loss(
     distance: jax.Array, logits: jax.Array, old: jax.Array, weight: jax.Array, l2: jax.Array | float
 ) -> jax.Array:
-    """Mean over weighted entries of the distance from the target plus `l2` times the change of mind (Eq. 4, 14).
+    """Mean over weighted entries: distance from the target plus `l2` times the squared change since collection.
+
+    This is Eq. 4 for fear and Eq. 14 for regret.
 
     Fear's target is the observed cost, regret's is how deliberate a costly action was; nothing else differs.
 
@@ -83,7 +85,7 @@ def regret(logits: jax.Array, cost: jax.Array) -> jax.Array:
 
 
 def deliberateness(z: jax.Array, target: Literal["mode", "tail"]) -> jax.Array:
-    """How much the policy meant an action entry `z` [...] deviations from its mean: what regret learns to predict.
+    """How much the policy meant an action entry, `z` [...] standard deviations from its mean: the target of regret.
 
     `mode`: density relative to the mode, exp(-z^2 / 2). `tail`: the probability of something even further out. A
     costly action that was meant is regretted, an accident of exploration is not.
@@ -170,7 +172,7 @@ def appraise_fear(
         distance = divergence(logits, cost, setup.config.fear_loss, noise, hyper.temperature)
         return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
 
-    net, metrics = fit(net, loss, (*rows, noise), key, **_appraisal_passes(setup, hyper))
+    net, metrics = fit(net, loss, (*rows, noise), key, **_fit_options(setup, hyper))
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     return net, fear, {**metrics, **calibration(remembered, batch.cost)}
 
@@ -203,7 +205,7 @@ def appraise_regret(
         return appraisal_loss(distance, logits, old, weight, hyper.regret_l2), {}
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
-    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, each[1], each[2], **_appraisal_passes(setup, hyper)))(
+    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, each[1], each[2], **_fit_options(setup, hyper)))(
         net, rows, keys
     )
     # Adam's momentum would move a network that had nothing to learn from.
@@ -234,7 +236,7 @@ def appraise_regret(
     return learned, log_weight, {**{k: x.mean(0) for k, x in metrics.items()}, **diagnostics}
 
 
-def _appraisal_passes(setup: Setup, hyper: Hyper) -> dict[str, Any]:
+def _fit_options(setup: Setup, hyper: Hyper) -> dict[str, Any]:
     return {
         "learning_rate": hyper.emotion_lr,
         "max_grad_norm": hyper.max_grad_norm,

@@ -103,7 +103,7 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
 
 
 def interval(x: np.ndarray) -> tuple[float, float]:
-    """Of independent figures [n]: the mean and the half-width of its 95 % interval (Student's t; nan for n = 1)."""
+    """Of independent values [n]: the mean and the half-width of its 95 % interval (Student's t; nan for n = 1)."""
     n = len(x)
     if n == 1:
         return float(x[0]), float("nan")
@@ -117,7 +117,7 @@ def is_better(
     """Whether a policy is better than the best so far: [...] bool, of mean episode rewards and costs [...].
 
     Within the cost limit beats beyond it; within it the higher reward is better, beyond it the lower cost. Figures
-    that are nan (no episode ended) improve on nothing.
+    that are nan (no episode ended) are never better.
     """
     within, was_within = cost <= limit, best_cost <= limit
     return np.where(within & was_within, reward > best_reward, np.where(was_within, False, cost < best_cost))

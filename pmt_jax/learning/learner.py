@@ -113,7 +113,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
         state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]
     )
 
-    # 5 Coping response: every agent's policy, and the price of danger.
+    # 5 Coping response: every agent's policy, and its multipliers.
     rows = policy_rows(setup, hyper, state, batch, advantage, cost_advantage, log_weight)
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
     cost_excess = lagrangian.cost_excess(episode_cost, hyper.cost_limit, setup.vector.horizon)
@@ -143,7 +143,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    """`hyper` with the step sizes that are left after so many updates."""
+    """`hyper` with the learning rates after so many updates."""
     # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
     left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
     rates = ("actor_lr", "critic_lr", "emotion_lr")

@@ -1,4 +1,4 @@
-"""The networks; the only file that knows flax."""
+"""The networks; the only file that uses flax."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class MLP(nn.Module):
 
 
 class Actor(nn.Module):
-    """Mean of the Gaussian as a function of the observation; its deviation is a parameter of its own."""
+    """Mean of the Gaussian as a function of the observation; its standard deviation is a parameter of its own."""
 
     trunk: MLP
 
@@ -141,7 +141,7 @@ class Networks:
         return jax.vmap(self.policy, in_axes=(0, -2), out_axes=(-2, 0))(params, obs)
 
     def is_std(self, params: Params) -> Params:
-        """True at the weights of an actor's deviation: on these its Fisher matrix is diagonal."""
+        """True at the weights of an actor's standard deviation: on these its Fisher matrix is diagonal."""
         return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, path[-1].key == "std"), params)
 
     def layers(self, params: Params) -> dict[str, jax.Array]:

@@ -1,4 +1,4 @@
-"""How policies improve on a batch: one after the other or all at once, by clipped epochs or by a trust-region step."""
+"""Policy updates: agent after agent or all at once, by clipped epochs or by a trust-region step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def update_policies(
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """Every agent's policy improves, and its price of danger follows.
+    """Updates every agent's policy, then its multipliers.
 
     Args:
       rows: leaves [N, R, ...]; violation: [N, K] in cost per step.
@@ -56,10 +56,10 @@ def policy_rows(
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
-    felt = scaled if setup.config.cost_advantage == "std" else centred
+    scaled_cost = scaled if setup.config.cost_advantage == "std" else centred
     if setup.config.regret_response == "advantage":
-        felt, log_weight = felt * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
-    hybrid = hybrid_advantage(advantage[..., None], felt, state.multiplier)
+        scaled_cost, log_weight = scaled_cost * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
+    hybrid = hybrid_advantage(advantage[..., None], scaled_cost, state.multiplier)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
     rows = PolicyRows(
@@ -85,7 +85,7 @@ def _sequential(
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """Agents improve one after the other in random order, each corrected by what those before it changed (HAPPO)."""
+    """Updates agents in random order, each corrected by the ratios of those before it (HAPPO)."""
 
     def one_agent(
         carry: tuple[TrainState, jax.Array, jax.Array], i: jax.Array
@@ -116,7 +116,7 @@ def _simultaneous(
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """All agents improve from the same policies; a shared actor learns from everybody's rows together."""
+    """Updates all agents from the same policies; a shared actor is fitted to the rows of all agents."""
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
     per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), rows)
@@ -147,7 +147,7 @@ def _policy_change(setup: Setup, params: Params, rows: PolicyRows) -> tuple[jax.
 def _update_multiplier(
     setup: Setup, hyper: Hyper, multiplier: jax.Array, rows: PolicyRows, cost_excess: jax.Array, log_ratio: jax.Array
 ) -> jax.Array:
-    """One agent's multipliers [K] after its policy has improved."""
+    """One agent's multipliers [K], given how its policy has changed."""
     if setup.method.constraint != "lagrangian":
         return multiplier
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
@@ -200,7 +200,7 @@ def _trust_region_steps(
 ) -> tuple[TrainState, Metrics]:
     """`trust_steps` constrained steps (MACPO), each on its part of the shuffled rows; one step takes the whole batch.
 
-    The optimiser's state is not touched. With several costs each step heeds the one most beyond its limit.
+    The optimiser's state is not touched. With several costs each step constrains the one most beyond its limit.
     """
     start, unravel = ravel_pytree(net.params)
     spread = rows.cost_advantage.std(0) + 1e-5

@@ -1,4 +1,4 @@
-"""Information source: the team acts in all environments for a while, and everything it saw is kept."""
+"""Rollout: the team acts in all environments for some steps, and the batch keeps what it saw, did and felt."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
 
 
 def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:
-    """The undiscounted cost per episode [N, K] that the multiplier answers to.
+    """The undiscounted cost per episode [N, K] that the multiplier is updated with.
 
     `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
     times the horizon; no lag, for batches much shorter than an episode.
@@ -126,7 +126,7 @@ def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: 
 
 
 def summary(batch: Batch) -> dict[str, jax.Array]:
-    """What happened, as scalars; episode figures are means over the episodes that ended (nan if none did).
+    """Metrics of a batch, scalars; episode metrics are means over the episodes that ended (nan if none did).
 
     episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
     summed over K). violation_rate: share of steps with a cost above 0 for some agent. step_reward, step_cost: means

@@ -110,7 +110,7 @@ class Batch:
 
 @pytree
 class PolicyRows:
-    """What a policy is improved on; R = T * B rows, with a leading [N] before an agent is chosen.
+    """The rows of a policy update; R = T * B rows, with a leading [N] before an agent is chosen.
 
     Attributes:
       obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
@@ -157,7 +157,7 @@ class LearnerState(ActingState):
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         that do not feel them.
       multiplier: [N, K], lambda.
-      episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier answers to.
+      episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier is updated with.
       state_moments: [S], of raw states.
       rollout: environments and running sums.
       key: the run's key; update u draws from fold_in(key, u).
@@ -176,7 +176,7 @@ class LearnerState(ActingState):
 
 @pytree
 class Best:
-    """Each seed's best learner state so far and the figures it was chosen by, with a leading [seeds].
+    """Each seed's best learner state so far and the metrics it was chosen by, with a leading [seeds].
 
     Attributes:
       state: the learner state.

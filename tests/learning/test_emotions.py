@@ -89,7 +89,7 @@ def test_calibration():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Tabular appraisal (specification, section 8.3)
+# Tabular appraisal
 
 PROBABILITY = np.asarray([0.0, 0.02, 0.3, 1.0])
 

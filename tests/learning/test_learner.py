@@ -34,7 +34,7 @@ def weights(state: LearnerState):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Equalities between methods (specification, section 8.2)
+# Equalities between methods
 
 
 def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
@@ -308,7 +308,7 @@ def test_observations_are_normalised_with_what_was_seen_before():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Learning (specification, section 8.4)
+# Learning
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Closed-form numbers of the specification (algorithms, section 8.1)."""
+"""Closed-form numbers ."""
 
 from __future__ import annotations
 

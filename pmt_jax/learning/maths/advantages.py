@@ -44,11 +44,11 @@ def gae(
 
 
 def standardise(advantage: jax.Array, floor: jax.Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
-    """Centres `advantage` [T, B, ...] over time and environments, and scales it to unit deviation.
+    """Centres `advantage` [T, B, ...] over time and environments, and scales it to unit standard deviation.
 
     Args:
-      floor: the deviation divided by is at least this, so that a batch nearly without cost is not blown up to noise
-        of unit size.
+      floor: the standard deviation divided by is at least this, so that a batch nearly without cost does not become
+        noise of unit size.
 
     Returns:
       centred (in the signal's unit) and scaled, both [T, B, ...].

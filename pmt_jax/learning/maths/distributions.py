@@ -26,6 +26,6 @@ def entropy(std: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def kl(mean0: jax.Array, std0: jax.Array, mean: jax.Array, std: jax.Array, mask: jax.Array) -> jax.Array:
-    """KL(N(mean0, std0) || N(mean, deviation)) in nats, summed over unmasked entries: [...]."""
+    """KL(N(mean0, std0) || N(mean, std)) in nats, summed over unmasked entries: [...]."""
     each = jnp.log(std / std0) + (std0**2 + (mean0 - mean) ** 2) / (2 * std**2) - 0.5
     return jnp.sum(mask * each, axis=-1)

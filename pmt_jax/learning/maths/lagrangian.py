@@ -1,4 +1,4 @@
-"""The price of danger: how far the cost is from its limit, and the multiplier that answers."""
+"""The Lagrangian multiplier: the excess of a cost over its limit, and the multiplier's step (Eq. 11, 16, 17)."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class RunningMoments:
 
 
 def init(shape: tuple[int, ...]) -> RunningMoments:
-    """Moments of nothing; they normalise as the identity until the first update (see `deviation`)."""
+    """Moments of nothing; they normalise as the identity until the first update (see `obs_scaling`)."""
     return RunningMoments(jnp.zeros(shape), jnp.zeros(shape), jnp.zeros(()))
 
 
@@ -56,7 +56,7 @@ def normalise_obs(moments: RunningMoments, x: jax.Array) -> jax.Array:
 
 
 def update_ema(moments: RunningMoments, x: jax.Array, decay: jax.Array | float) -> RunningMoments:
-    """Exponentially forgetting raw moments of `x` [..., *shape], for returns (specification, section 2.2)."""
+    """Exponentially forgetting raw moments of `x` [..., *shape], for returns (PopArt; van Hasselt et al., 2016)."""
     rows = x.reshape(-1, *moments.mean.shape)
     return RunningMoments(
         decay * moments.mean + (1 - decay) * rows.mean(0),
