@@ -19,7 +19,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from pmt_jax.cli.main import answer, refuse_unknown
+from pmt_jax.cli.parser import refuse_unknown
+from pmt_jax.cli.process import answer
 from pmt_jax.errors import UsageError
 
 from . import compare, records, render, runner, runs

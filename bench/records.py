@@ -17,7 +17,7 @@ import jax
 from envs.physics import usable_cpus
 from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
-from pmt_jax.training.run_folder import version
+from pmt_jax.tasks import installed_version
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -46,7 +46,7 @@ def conditions() -> dict[str, Any]:
         "machine": machine(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        "versions": {"python": platform.python_version(), **{p: v for p in PACKAGES if (v := version(p))}},
+        "versions": {"python": platform.python_version(), **{p: v for p in PACKAGES if (v := installed_version(p))}},
         "commit": (git("rev-parse", "--short", "HEAD") or "unknown").strip() + changed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "load_average": [round(x, 2) for x in os.getloadavg()],

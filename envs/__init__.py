@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import textwrap
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -77,14 +78,23 @@ def columns(name: str) -> Mapping[str, Column]:
     return _TASKS[name].columns if name in _TASKS else {}
 
 
-def task_options(name: str) -> list[str]:
-    """The names of the options that a task takes.
+def task_options(name: str) -> dict[str, Any]:
+    """The options that a task takes, with their defaults.
 
     Raises:
       TaskError: unknown name.
     """
     cls, fixed = _class(name)
-    return [p for p in inspect.signature(cls).parameters if p not in fixed]
+    return {p.name: p.default for p in inspect.signature(cls).parameters.values() if p.name not in fixed}
+
+
+def explain_options(name: str) -> str:
+    """What a task's docstring says of its arguments; '' where it says nothing.
+
+    Raises:
+      TaskError: unknown name.
+    """
+    return textwrap.dedent((inspect.getdoc(_class(name)[0]) or "").partition("Args:\n")[2])
 
 
 def _class(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:

@@ -27,10 +27,13 @@ __all__ = [
     "declarations",
     "did_you_mean",
     "engines",
+    "explain_options",
+    "installed_version",
     "felt_cost",
     "is_file",
     "make",
     "names",
+    "options",
 ]
 
 
@@ -95,6 +98,11 @@ def columns(name: str) -> Mapping[str, Column]:
     return _envs().columns(name)
 
 
+def installed_version(package: str) -> str | None:
+    """A package's version; None where it is missing."""
+    return importlib.import_module(f"{_envs().__name__}.versions").installed_version(package)
+
+
 def engines() -> tuple[str, dict[str, str | None]]:
     """The physics engine that `auto` takes here, and for each engine why it cannot run here, None where it can.
 
@@ -104,6 +112,7 @@ def engines() -> tuple[str, dict[str, str | None]]:
     package = _envs()
     try:
         physics = importlib.import_module(f"{package.__name__}.physics")
+        physics.check_versions()
         return physics.resolve("auto"), physics.explain()
     except package.TaskError as error:
         raise UsageError(str(error)) from error
@@ -124,3 +133,27 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
         return envs.make(name, **options)
     except envs.TaskError as error:
         raise UsageError(str(error)) from error
+    except Exception as error:
+        given = ", ".join(f"{option} = {value!r}" for option, value in options.items() if option != "physics")
+        if not given:
+            raise
+        reason = (str(error).splitlines() or [""])[0]
+        raise UsageError(f"task '{name}' cannot be built with {given}: {type(error).__name__}: {reason}") from error
+
+
+def options(name: str) -> dict[str, Any]:
+    """The options that a task takes, with their defaults.
+
+    Raises:
+      UsageError: unknown task.
+    """
+    envs = _envs()
+    try:
+        return envs.task_options(name)
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from error
+
+
+def explain_options(name: str) -> str:
+    """What the class of a task says of its options."""
+    return _envs().explain_options(name)

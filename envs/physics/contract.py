@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import TaskError, one_of
+from ..versions import installed_version
 
 if TYPE_CHECKING:
     import mujoco  # at runtime after `check_versions`: a missing MuJoCo then gets its sentence
@@ -38,14 +38,6 @@ def check_versions() -> None:
         )
     if jax.__version__.startswith("0.10."):
         raise TaskError(f"jax {jax.__version__} deadlocks on CPUs; pip install 'jax>=0.9.2,!=0.10.*'")
-
-
-def installed_version(package: str) -> str | None:
-    """A package's version; None where it is missing."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 check_versions()

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from ..errors import TaskError
-from .contract import INSTALL, MUJOCO_SERIES, installed_version
+from ..versions import installed_version
+from .contract import INSTALL, MUJOCO_SERIES
 
 
 def import_mjx() -> Any:

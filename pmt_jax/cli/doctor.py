@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from importlib import metadata
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import pmt_jax
 
 from .. import tasks
 from ..errors import UsageError
+from ..output import say
+from ..probe import run_python
+from ..render import gl
+from .parser import command
+from .process import at_once
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-EXTRAS = {"warp-lang": "warp", "imageio-ffmpeg": "render", "brax": "adapters", "tensorboardX": "log", "wandb": "log"}
-GL_BACKENDS = ("egl", "osmesa", "glfw")
+EXTRAS = {  # which of our extras brings an optional package
+    "warp-lang": "warp",
+    "imageio-ffmpeg": "render",
+    "gymnasium": "adapters",
+    "pettingzoo": "adapters",
+    "brax": "adapters",
+    "tensorboardX": "log",
+    "wandb": "log",
+}
 _CACHE_PROBE = """
 import jax
 from pmt_jax.training.compile import cache_events
@@ -27,16 +37,6 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 with cache_events() as events:
     jax.jit(lambda x: x @ x).lower(jax.ShapeDtypeStruct((3, 3), "float32")).compile()
 assert "cache_hits" in events, "no hit"
-"""
-_GL_PROBE = """
-import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco/>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-renderer = mujoco.Renderer(model, 16, 16)
-renderer.update_scene(data)
-renderer.render()
-renderer.close()
 """
 
 
@@ -54,6 +54,18 @@ class Finding(NamedTuple):
     text: str
 
 
+def add(commands: Any) -> None:
+    """Adds the command."""
+    command(commands, "doctor", run, "what of this machine can be used, and why not the rest")
+
+
+@at_once()
+def run(arguments: argparse.Namespace) -> int:
+    """Prints all findings."""
+    del arguments
+    return report(say)
+
+
 def report(say: Callable[[str], None]) -> int:
     """Says all findings; returns 0, or 1 where one is bad."""
     bad = 0
@@ -68,42 +80,19 @@ def examine() -> Iterator[Finding]:
     """Looks at everything in turn. Where JAX is missing or a version is wrong, what would need it is left out."""
     yield Finding("ok", "pmt-jax", f"{pmt_jax.__version__} in {os.path.dirname(pmt_jax.__file__)}")
     yield Finding("ok", "python", f"{platform.python_version()} on {platform.platform()}")
-    found = {name: _version(name) for name in PACKAGES}
+    found = {name: tasks.installed_version(name) for name in PACKAGES}
     for name, version in found.items():
         missing = "missing; reinstall with pip install pmt-jax"
         yield Finding("ok", name, version) if version else Finding("bad", name, missing)
-    yield _jax_version(found["jax"])
-    yield _mujoco_pair(found["mujoco"], found["mujoco-mjx"])
     if found["jax"] and found["jaxlib"]:
         yield _devices()
         yield from _engines()
         yield _cache()
     yield from _rendering()
     for name, extra in EXTRAS.items():
-        version = _version(name)
+        version = tasks.installed_version(name)
         absent = Finding("no", name, f"not installed; optional: pip install 'pmt-jax[{extra}]'")
         yield Finding("ok", name, version) if version else absent
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _jax_version(version: str | None) -> Finding:
-    if version and version.startswith("0.10."):
-        cure = "pip install 'jax>=0.9.2,!=0.10.*'"
-        return Finding("bad", "jax release", f"{version} deadlocks for ever on CPUs with few cores; {cure}")
-    return Finding("ok", "jax release", "not one of 0.10.*, which deadlock on CPUs")
-
-
-def _mujoco_pair(mujoco: str | None, mjx: str | None) -> Finding:
-    if mujoco == mjx and mujoco is not None and mujoco.startswith("3.17."):
-        return Finding("ok", "mujoco pair", f"mujoco and mujoco-mjx are both {mujoco}")
-    cure = "pip install 'mujoco==3.17.*' 'mujoco-mjx==3.17.*'"
-    return Finding("bad", "mujoco pair", f"need the same 3.17.*, found mujoco {mujoco}, mujoco-mjx {mjx}; {cure}")
 
 
 def _devices() -> Finding:
@@ -140,24 +129,14 @@ def _cache() -> Finding:
         return Finding("no", "compile cache", f"{holds}; it cannot be written, so every start compiles anew")
     with tempfile.TemporaryDirectory() as folder:
         environment = {"JAX_COMPILATION_CACHE_DIR": folder, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-        _, second = (_probe(_CACHE_PROBE, environment) for _ in range(2))
+        _, second = (run_python(_CACHE_PROBE, **environment) for _ in range(2))
     if second:
         return Finding("no", "compile cache", f"{holds}; it never hits on this machine, so every start compiles anew")
     return Finding("ok", "compile cache", f"{holds}; a second process hits what a first has compiled")
 
 
 def _rendering() -> Iterator[Finding]:
-    """Tries each of MuJoCo's ways to draw; some end their process when they fail."""
-    for backend in GL_BACKENDS:
-        error = _probe(_GL_PROBE, {"MUJOCO_GL": backend})
+    """Tries each of MuJoCo's ways to draw."""
+    for backend in gl.backends():
+        error = gl.obstacle(backend)
         yield Finding("no", f"GL {backend}", error) if error else Finding("ok", f"GL {backend}", "draws")
-
-
-def _probe(code: str, environment: dict[str, str]) -> str | None:
-    """Runs Python code in a process of its own; the last line of its complaint, None where it had none."""
-    command = [sys.executable, "-c", code]
-    try:
-        done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=60)
-    except subprocess.TimeoutExpired:
-        return "does not answer within 60 s"
-    return (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1] if done.returncode else None

@@ -10,7 +10,7 @@ import threading
 
 from ..output import say
 from ..studies import sweep
-from .main import answer
+from .process import answer
 
 
 def _end_with_parent() -> None:

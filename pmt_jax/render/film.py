@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import os
 import pathlib
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,20 +15,13 @@ import numpy as np
 
 from ..errors import UsageError, optional
 from ..files import writing
-from . import grid_map, page
+from . import gl, grid_map, page
 from .episode import Episode, record_run
 
 FORMATS = (".mp4", ".gif", ".html")
 SIZE = (640, 360)  # pixels
 COLOURS = 48  # of a GIF
 DANGER, PAPER, INK = (200, 64, 47), (251, 250, 248), (29, 33, 37)
-BACKENDS = {"linux": ("egl", "osmesa", "glfw"), "darwin": ("cgl", "glfw")}
-_PROBE = """
-import mujoco, mujoco.{0} as platform
-context = platform.GLContext(8, 8)
-context.make_current()
-mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), mujoco.mjtFontScale.mjFONTSCALE_50)
-"""
 
 
 def render(
@@ -82,7 +73,7 @@ def render(
 def _frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """[height, width, 3] pictures of an episode's moments."""
     if episode.picture.kind == "scene":
-        return _bodies(episode, size, gl_platform())
+        return _bodies(episode, size, gl.choose())
     if episode.picture.kind == "map":
         return _maps(episode, size)
     raise UsageError(f"task '{episode.env.spec.name}' has no film; write a page instead: -o replay.html")
@@ -90,27 +81,6 @@ def _frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Bodies, drawn by MuJoCo
-
-
-def gl_platform() -> str:
-    """The way to OpenGL that works here: egl, osmesa, glfw, cgl; MUJOCO_GL, where set, is the only one tried.
-
-    Raises:
-      UsageError: none does.
-    """
-    wanted = os.environ.get("MUJOCO_GL")
-    names = (wanted,) if wanted else BACKENDS.get(sys.platform, ("glfw",))
-    for name in names:
-        # In a process of its own: a platform that fails leaves PyOpenGL unusable for the next, or kills the process.
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            if not subprocess.run(
-                [sys.executable, "-c", _PROBE.format(name)], capture_output=True, timeout=60
-            ).returncode:
-                return name
-    raise UsageError(
-        f"no OpenGL works here (tried {', '.join(names)}): install a software one (apt-get install libosmesa6), "
-        "or write a page, which needs none: -o replay.html"
-    )
 
 
 def _bodies(episode: Episode, size: tuple[int, int], platform: str) -> Iterator[np.ndarray]:

@@ -147,7 +147,7 @@ def from_words(source: Source, words: Sequence[str], draws: int = 0, seed: int =
     values, ranges = {}, {}
     for word in words:
         name, _, text = word.partition("=")
-        if not text:
+        if not text.strip(","):
             raise UsageError(f"--set takes NAME=VALUE,VALUE,..., or with --random NAME=LOW:HIGH, not '{word}'")
         name = name.replace("-", "_")
         if found := _range(text):

@@ -39,7 +39,9 @@ class Programs(NamedTuple):
 
 def cache_folder() -> pathlib.Path:
     """Where compiled programs are kept between starts, unless JAX was told another place."""
-    home = pathlib.Path(os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache"))
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
+    # By its specification, a path that is empty or relative does not count.
+    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
     return pathlib.Path(getattr(jax.config, "jax_compilation_cache_dir", None) or home / "pmt-jax")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import json
 import pathlib
 import platform
@@ -24,6 +23,7 @@ from ..learning import learner
 from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
+from ..tasks import installed_version
 from . import claims
 from .checkpoint import Checkpoints
 from .metrics import Row
@@ -111,18 +111,10 @@ def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
 
 def versions(setup: Setup) -> dict[str, Any]:
     """What the results of a run depend on besides its settings."""
-    found: dict[str, Any] = {name: version(name) for name in PACKAGES}
+    found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
-
-
-def version(package: str) -> str | None:
-    """A package's version, None where it is not installed."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def write_settings(out: pathlib.Path, setup: Setup) -> None:

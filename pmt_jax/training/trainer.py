@@ -21,7 +21,7 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import claims, health, processes, run_folder
+from . import claims, health, memory, processes, run_folder
 from .checkpoint import Checkpoints
 from .compile import Programs, compile_run, use_cache
 from .loggers import Logger, Profile, check_loggers, open_loggers
@@ -71,6 +71,7 @@ def train(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(make_setup(config), trials=trials, mesh=sharding.make_mesh(config, count))
+        memory.check(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say))
         _describe(setup, out, say)
         if cache:
@@ -281,7 +282,7 @@ class Trainer:
             self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self._command}")
             return 128 + (interrupts.received[0] if interrupts.received else signal.SIGINT)
         if not self.all_broken:
-            next_step = "" if self.setup.trials else f"; evaluate with: pmt eval {self.out}"
+            next_step = "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.out)])}"
             self.say(f"done: {self.step:,} steps in {duration(self.seconds)}{next_step}")
         return int(self._overflow or (bool(self.broken) and not self.setup.trials))
 

@@ -20,7 +20,7 @@ from envs.base import Declarations, Scene
 from envs.voltage.layout import layout
 from pmt_jax import tasks
 from pmt_jax.errors import UsageError
-from pmt_jax.render import episode, film, grid_map, page, report
+from pmt_jax.render import episode, film, gl, grid_map, page, report
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1, "--no-cache")
 
@@ -218,7 +218,7 @@ def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeyp
     monkeypatch.setattr(film, "record_run", lambda *_: ant)
     out = tmp_path / "ant.gif"
     try:
-        film.gl_platform()
+        gl.choose()
     except UsageError as error:
         assert "-o replay.html" in str(error)
         pytest.skip("no OpenGL on this machine")
@@ -233,10 +233,10 @@ def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeyp
 
 
 def test_without_opengl_a_sentence_names_the_way_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(film, "_PROBE", "raise SystemExit(1)  # {0}")
+    monkeypatch.setattr(gl, "_PROBE", "raise SystemExit(1)  # {0}")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with pytest.raises(UsageError, match=r"no OpenGL works here \(tried .*-o replay.html"):
-        film.gl_platform()
+        gl.choose()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

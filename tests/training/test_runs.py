@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
 
 from pmt_jax import load_config, load_policy, make_setup
-from pmt_jax.cli import doctor
 from pmt_jax.errors import UsageError
 from pmt_jax.learning.evaluation import interval, is_better
 from pmt_jax.learning.maths import running_moments
@@ -308,29 +307,3 @@ def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pat
     obs = 5 * jax.random.normal(jax.random.key(2), (4, 3, 2, 8))
     expected = run.nets.policies(params, run.scale(moments, obs))[0]
     np.testing.assert_allclose(numpy_policy.load(tmp_path / "policy.npz")(obs), expected, rtol=2e-5, atol=2e-5)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Doctor
-
-
-def test_doctor(cli, monkeypatch):
-    code, out, _ = cli("doctor")
-    assert code == 0 and out.endswith("pmt can train here\n")
-    for words in (
-        "mujoco and mujoco-mjx are both 3.17",
-        "engine mujoco",
-        "physics = auto takes",
-        "needs an NVIDIA GPU",
-    ):
-        assert words in out
-    for part in ("devices", "compile cache", "GL egl", "wandb"):
-        assert re.search(rf"^(ok|no) +{part} ", out, re.MULTILINE)
-
-    actual = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: "0.10.1" if name == "jax" else actual(name))
-    monkeypatch.setattr(doctor, "_probe", lambda code, environment: "no such library")
-    code, out, _ = cli("doctor")
-    assert code == 1 and "deadlocks for ever" in out and re.search("^no +GL egl +no such library", out, re.MULTILINE)
-    monkeypatch.setattr(doctor, "_version", lambda name: "4.0.0" if name == "mujoco" else actual(name))
-    assert "need the same 3.17.*, found mujoco 4.0.0, mujoco-mjx 3.17" in cli("doctor")[1]

@@ -1,0 +1,81 @@
+"""A flag for every setting, in groups, with the defaults of the task that is asked about."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import Any
+
+from ..config import toml
+from ..config.fields import GROUPS, expectation
+from ..config.methods import METHODS
+from ..config.settings import FIELDS, Config, load_config
+from .parser import HELP
+
+_METAVARS = {int: "N", float: "X"}
+_PREFIX = "set_"  # of the names under which argparse keeps settings
+
+
+def add_settings(parser: argparse.ArgumentParser) -> dict[str, argparse._ArgumentGroup]:
+    """A flag for every field of Config, --preset, and --help; returns the groups, for more flags that belong there.
+
+    The parser is made with add_help=False.
+    """
+    groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
+    parser.add_argument(*HELP, action=_Help, help="shows this; after a TASK with the task's own defaults")
+    presets = "; ".join(f"{name}: {about}" for name, about in toml.presets().items())
+    groups["common"].add_argument(
+        "--preset", default="default", metavar="WORD", help=f"settings laid over the task's own ({presets})"
+    )
+    for field in dataclasses.fields(Config):
+        if field.name == "task":  # it is the positional argument
+            continue
+        kind = FIELDS[field.name]
+        metavar = "NAME=VALUE" if field.name == "env" else _METAVARS.get(kind, "WORD")
+        action = "append" if field.name == "env" else "store"
+        flag = f"--{field.name.replace('_', '-')}"
+        groups[field.metadata["group"]].add_argument(flag, dest=_PREFIX + field.name, metavar=metavar, action=action)
+    return groups
+
+
+def given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The settings that the command line names."""
+    pairs = vars(arguments).items()
+    return {name.removeprefix(_PREFIX): x for name, x in pairs if name.startswith(_PREFIX) and x is not None}
+
+
+class _Help(argparse.Action):
+    """--help, where what the settings are for the task and flags before it is read only now."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(nargs=0, **options)
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
+    ) -> None:
+        """Prints the help and ends."""
+        source = namespace.source
+        known = source and not (hasattr(namespace, "vary") and source.endswith(".toml"))  # a file may hold a sweep
+        config = load_config(source, preset=namespace.preset, **given(namespace)) if known else Config()
+        if known:
+            parser.description = f"{parser.description} Defaults are those of {source}."
+        fields = {field.name: field for field in dataclasses.fields(Config)}
+        for action in parser._actions:
+            if action.dest.startswith(_PREFIX):
+                action.help = _help(fields[action.dest.removeprefix(_PREFIX)], config)
+        parser.print_help()
+        parser.exit()
+
+
+def _help(field: dataclasses.Field[Any], config: Config) -> str:
+    kind, value = FIELDS[field.name], getattr(config, field.name)
+    words = " | ".join(METHODS) if field.name == "method" else expectation(kind)
+    shown = f"default {_shown(value)}" if kind in _METAVARS else f"{words}; default {_shown(value)}"
+    return f"{field.metadata['help']} [{shown}]".replace("%", "%%")
+
+
+def _shown(value: Any) -> str:
+    """A setting's value as one would type it."""
+    if isinstance(value, tuple):
+        return ",".join(f"{x[0]}={x[1]}" if isinstance(x, tuple) else str(x) for x in value) or "none"
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,108 @@
+"""`pmt eval`, `pmt export`, `pmt hub`: what a trained team is used for."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import pathlib
+from typing import Any
+
+from ..config.settings import convert
+from ..errors import UsageError
+from ..output import say
+from .parser import RUN, add_deterministic, add_seed, add_which, command, limits, whole
+from .process import at_once
+
+
+def add(commands: Any) -> None:
+    """Adds the commands."""
+    evaluation = command(
+        commands,
+        "eval",
+        run_eval,
+        "evaluate a trained run: pmt eval runs/x; or a baseline: pmt eval voltage_33 --policy droop",
+        description="Reward, cost, violation rate and the task's own metrics over whole episodes with fixed keys.",
+    )
+    evaluation.add_argument("source", metavar="RUN|TASK", help=f"{RUN}; with --policy a task's name")
+    evaluation.add_argument("--policy", metavar="WORD", help="a baseline: zero, random, droop or opf (voltage tasks)")
+    evaluation.add_argument("--env", action="append", metavar="NAME=VALUE", help="with --policy: the task's options")
+    evaluation.add_argument("--episodes", type=whole(1), default=32, metavar="N", help="episodes per seed (default 32)")
+    add_deterministic(evaluation)
+    add_which(evaluation)
+    evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
+
+    export = command(
+        commands,
+        "export",
+        run_export,
+        "write a trained policy as files: pmt export runs/x -o policy",
+        description="Writes policy.stablehlo (jax.export), policy.npz (weights) and numpy_policy.py (their loader).",
+    )
+    export.add_argument("source", metavar="RUN", type=pathlib.Path, help=RUN)
+    export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
+    add_seed(export)
+    add_which(export)
+
+    command(commands, "hub", run_hub, "list the pretrained policies, and how good they are")
+
+
+@at_once()
+def run_eval(arguments: argparse.Namespace) -> int:
+    """Prints what a run's policies, or a baseline, reach."""
+    for flag in ("which", "physics") if arguments.policy else ("env",):
+        if getattr(arguments, flag) is not None:
+            why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
+            raise UsageError(f"--{flag} {why}")
+    from ..policies import evaluate
+
+    episodes = arguments.episodes
+    if arguments.policy:
+        options = dict(convert("env", arguments.env or ()))
+        rows = [evaluate.evaluate_baseline(arguments.source, arguments.policy, episodes, options)]
+        how = f"policy {arguments.policy}"
+    else:
+        run, which = pathlib.Path(arguments.source), arguments.which or "last"
+        rows = evaluate.evaluate_run(run, episodes, arguments.deterministic, which, arguments.physics, say=say)
+        how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
+        how += " of the best policy" if which == "best" else ""
+    shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
+    say(f"{arguments.source}: {episodes} episodes a seed, {how}; {shown}")
+    for row in rows:
+        _say_row(row)
+    return 0
+
+
+def _say_row(row: dict[str, Any]) -> None:
+    """One seed's metrics, a line each."""
+    whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
+    say(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
+    metrics = {name: x for name, x in row.items() if isinstance(x, tuple)}
+    width = max(24, *map(len, metrics))
+    for name, (mean, half) in metrics.items():
+        say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    """Writes a policy as files."""
+    with at_once():
+        from ..policies.export import export_policy
+
+    export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
+    say(f"wrote policy.stablehlo, policy.npz and numpy_policy.py into {arguments.out}")
+    return 0
+
+
+@at_once()
+def run_hub(arguments: argparse.Namespace) -> int:
+    """Lists the pretrained policies."""
+    del arguments
+    from ..policies import hub
+
+    say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/pretrained.md)")
+    width = max(map(len, hub.names()), default=0)
+    for name in hub.names():
+        facts = hub.about(name)
+        (reward, rewards), (cost, costs) = (facts["figures"][f"episode_{what}"] for what in ("reward", "cost"))
+        limit = f"limit {facts['cost_limit']:g}"
+        say(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
+    return 0

@@ -1,0 +1,72 @@
+"""What a command does to its process: exit codes, output, and the environment that JAX finds."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+from ..errors import UsageError
+
+
+def answer(name: str, command: Callable[[], int]) -> int:
+    """The exit code of `command`; a user's mistake gets one sentence that begins with the program's `name`, and 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what the terminal cannot show
+    try:
+        code = command()
+        sys.stdout.flush()  # here, where a closed pipe is noticed, and not when Python ends
+        return code
+    except UsageError as error:
+        return _refuse(name, str(error))
+    except KeyboardInterrupt:
+        return 130
+    except SystemExit as end:  # argparse has printed its help
+        return int(end.code or 0)
+    except BrokenPipeError:  # the reader of our output, head for example, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:  # a path that is too long, a folder that may not be read, a full disk
+        return _refuse(name, f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+
+
+def _refuse(name: str, sentence: str) -> int:
+    """Prints why `name` did nothing, control characters escaped; returns the exit code."""
+    shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in sentence)
+    print(f"{name}: {shown}", file=sys.stderr)
+    return 2
+
+
+@contextlib.contextmanager
+def at_once() -> Iterator[None]:
+    """Ctrl-C ends the process at once, for commands or moments that leave nothing half written.
+
+    As an exception it would be lost in JAX's callbacks, wait for the compiler, or leave half a module imported. XLA's
+    C++ log is silenced before it loads: it would print a page of CPU features for every program from the compile cache.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield  # ignored, as in the background, or in the hands of whoever runs us
+        return
+    signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def refuse_many(command: str, jobs: int) -> None:
+    """Refuses to run once in each of several processes, which would write into the same folders."""
+    from ..studies.workers import share_memory
+    from ..training import processes
+
+    processes.make_room()
+    if jobs > 1:
+        share_memory()
+    if processes.in_step():
+        raise UsageError(f"{command} runs in one process; start it without srun, or with srun --ntasks=1")

@@ -1,0 +1,126 @@
+"""`pmt sweep`, `pmt table`, `pmt reproduce`: many runs."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+from typing import Any
+
+from ..errors import UsageError
+from ..output import say
+from .flags import add_settings, given
+from .parser import SOURCE, add_format, add_jobs, command, whole
+from .process import at_once, refuse_many
+
+
+def add(commands: Any) -> None:
+    """Adds the commands."""
+    sweep = command(
+        commands,
+        "sweep",
+        run_sweep,
+        "train many settings side by side: pmt sweep ant_2x4 --set lambda_lr=0.03,0.1,0.3 --set fear_l2=0,1",
+        usage="pmt sweep TASK|CONFIG --set NAME=VALUE,... [--set ...] --out DIR [--SETTING VALUE ...]",
+        description="Trains every combination of the --set values; the same command continues an interrupted sweep.",
+        add_help=False,
+    )
+    sweep.add_argument("source", metavar="TASK|CONFIG", help=f"{SOURCE}; a TOML file may hold [[sweep]] tables")
+    sweep.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="vary",
+        metavar="NAME=VALUE,...",
+        help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]; "
+        "or with --random a range: NAME=LOW:HIGH, NAME=log:LOW:HIGH",
+    )
+    sweep.add_argument("--random", type=whole(0), default=0, metavar="N", help="draw N values from each range of --set")
+    sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="of these draws (default 0)")
+    sweep.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR", help="gets a run folder per point")
+    add_jobs(sweep)
+    add_settings(sweep)
+
+    table = command(
+        commands,
+        "table",
+        run_table,
+        "compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
+        description="One row per task, method and settings: interquartile means with 95 % intervals.",
+    )
+    table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
+    table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
+    table.add_argument("--test", action="store_true", help="also test against it: Mann-Whitney's U, Holm's correction")
+    add_format(table)
+    table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
+
+    reproduce = command(
+        commands,
+        "reproduce",
+        run_reproduce,
+        "run what is missing for a table of the paper and print it: pmt reproduce table1",
+        description="The same command continues where it was interrupted.",
+    )
+    reproduce.add_argument("table", metavar="TABLE", help="table1 | table2 | table3 | fig4")
+    reproduce.add_argument(
+        "--budget",
+        default="smoke",
+        metavar="WORD",
+        help="smoke (default): minutes, to see that everything runs | paper: 5 seeds, all steps; days on a CPU",
+    )
+    reproduce.add_argument(
+        "--out", type=pathlib.Path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
+    )
+    add_jobs(reproduce)
+    add_format(reproduce)
+
+
+@at_once()
+def run_sweep(arguments: argparse.Namespace) -> int:
+    """Trains all combinations of some settings' values."""
+    from ..studies.points import from_file, from_words, has_parts, make_points
+
+    source, words, draws = arguments.source, arguments.vary, arguments.random
+    if has_parts(source) and (words or draws):
+        raise UsageError(f"{source} says itself what to sweep; leave out --set and --random")
+    if not (words or has_parts(source)):
+        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
+    parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)
+    points = make_points(parts, arguments.preset, **given(arguments))
+    refuse_many("pmt sweep", arguments.jobs)
+    from ..studies import sweep
+
+    return sweep.sweep(parts, points, arguments.out, _launch(arguments))
+
+
+def _launch(arguments: argparse.Namespace) -> Any:
+    from ..studies import sweep
+
+    return sweep.Launch(not arguments.no_cache, say, arguments.devices, arguments.jobs)
+
+
+@at_once()
+def run_table(arguments: argparse.Namespace) -> int:
+    """Prints or writes runs as a table."""
+    from ..files import writing
+    from ..studies import table
+    from ..studies.rows import rows
+    from ..studies.run_log import read_all
+
+    found = rows(read_all(arguments.sources))
+    text = table.render(found, arguments.format, arguments.baseline, arguments.test)
+    if arguments.output is None:
+        print(text, end="")
+        return 0
+    with writing(arguments.output) as partial:
+        partial.write_text(text)
+    return 0
+
+
+@at_once()
+def run_reproduce(arguments: argparse.Namespace) -> int:
+    """Trains what is missing of one of the paper's tables and prints it."""
+    refuse_many("pmt reproduce", arguments.jobs)
+    from ..studies import reproduce
+
+    out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
+    return reproduce.reproduce(arguments.table, arguments.budget, out, arguments.format, _launch(arguments))

@@ -1,0 +1,66 @@
+"""`pmt train`: trains a team."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+from typing import Any
+
+from ..config.settings import load_config
+from ..errors import UsageError
+from ..output import say
+from .flags import add_settings, given
+from .parser import SOURCE, add_cache, add_devices, command, names, whole
+from .process import at_once
+
+
+def add(commands: Any) -> None:
+    """Adds the command."""
+    parser = command(
+        commands,
+        "train",
+        run,
+        "train a team: pmt train ant_2x4",
+        usage="pmt train TASK|CONFIG [--SETTING VALUE ...]",
+        description="Trains on TASK, or as a TOML file says, in which every setting below may stand too.",
+        add_help=False,
+    )
+    parser.add_argument("source", metavar="TASK|CONFIG", help=SOURCE)
+    output = add_settings(parser)["output"]
+    output.add_argument("--out", type=pathlib.Path, metavar="DIR", help="the run folder (default: a new one in runs/)")
+    output.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
+    output.add_argument(
+        "--sink",
+        type=names,
+        default=[],
+        metavar="NAMES",
+        help="metrics also go to any of csv, tensorboard, wandb",
+    )
+    output.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="JAX profiler trace of a few chunks")
+    add_cache(output)
+    hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
+    add_devices(hosts)
+    hosts.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process listens")
+    hosts.add_argument("--process", type=whole(0), metavar="I", help="which process this is, from 0")
+    hosts.add_argument("--processes", type=whole(1), metavar="N", help="how many there are")
+
+
+@at_once()
+def run(arguments: argparse.Namespace) -> int:
+    """Trains as the arguments say."""
+    config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
+    if arguments.resume and arguments.out is None:
+        raise UsageError("--resume needs --out, the folder of the run to continue")
+    from ..training import processes, trainer
+
+    processes.join(arguments.coordinator, arguments.process, arguments.processes)
+    return trainer.train(
+        config,
+        arguments.out,
+        arguments.resume,
+        cache=not arguments.no_cache,
+        loggers=arguments.sink,
+        profile=arguments.profile,
+        say=say,
+        count=arguments.devices,
+    )
