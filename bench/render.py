@@ -15,13 +15,13 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
-from . import records, runs
+from . import records, runs, study
 from .tables import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
-STORED = {"curves": runs.as_pmt_table, "points": runs.as_points}
+STORED = {"curves": runs.as_pmt_table, "points": runs.as_points, **study.FORMS}
 
 
 def documents() -> list[pathlib.Path]:

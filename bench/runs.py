@@ -22,13 +22,16 @@ from . import records
 Run = dict[str, Any]
 
 CURVES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
+TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_seen have none
+DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "cost_critic/explained_variance")  # means over seeds
 WHILE_TRAINING = "cost while training"
+TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
 def store(folders: Sequence[pathlib.Path], out: pathlib.Path) -> int:
     """Writes the run folders among and below `folders` into a JSON file; returns how many there are."""
     found = [_compact(run) | {"label": group.label} for group in groups(read_all(folders)) for run in group.runs]
-    out.write_text(json.dumps(found) + "\n")
+    out.write_text(json.dumps(found, separators=(",", ":")) + "\n")
     return len(found)
 
 
@@ -50,15 +53,20 @@ def load(file: pathlib.Path) -> list[Run]:
 def _compact(log: RunLog) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
-    Curves are {name: [seeds][points]}, None where unknown; `table` is {column: [seeds]}, see `pmt_jax.studies.table`,
-    and the mean cost of all episodes while it trained.
+    Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are their means over seeds [points]; `table`
+    is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean cost of all episodes while it trained.
     """
     found, (row,) = log.thinned(plot.POINTS), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
+    if "true_step_cost" in log.metrics:
+        scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
+    names = [name for name in (*CURVES, *TRUE_CURVES) if name in found.metrics]
+    diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(DIAGNOSTICS)}
     return {
         "steps": found.steps.tolist(),
         "seeds": list(found.seeds),
-        **{name: [[_rounded(x) for x in seed] for seed in found.metrics[name]] for name in CURVES},
+        **{name: [[_rounded(x) for x in seed] for seed in found.metrics[name]] for name in names},
+        "diagnostics": {name: [_rounded(x) for x in mean] for name, mean in diagnostics.items()},
         "table": {column: [_rounded(x) for x in seeds] for column, seeds in scores.items()},
         "source": row.source,
         "task": found.task,
@@ -72,7 +80,7 @@ def _compact(log: RunLog) -> Run:
 
 
 def _rounded(x: float) -> float | None:
-    return float(f"{x:.6g}") if np.isfinite(x) else None
+    return float(f"{x:.5g}") if np.isfinite(x) else None
 
 
 def curves(run: Run) -> RunLog:
@@ -85,7 +93,7 @@ def curves(run: Run) -> RunLog:
         settings=tomllib.loads(run["config"]),
         seeds=tuple(run["seeds"]),
         steps=np.array(run["steps"]),
-        metrics={name: np.array(run[name], float) for name in CURVES},
+        metrics={name: np.array(run[name], float) for name in (*CURVES, *TRUE_CURVES) if name in run},
     )
 
 

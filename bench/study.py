@@ -1,0 +1,191 @@
+"""The tables of docs/study.md: stored runs of seldom felt costs, read as the preregistration says."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from pmt_jax.config.settings import Config
+from pmt_jax.studies.statistics import holm, iqm, iqm_interval, probability_of_improvement, u_test
+
+from . import records, runs
+from .tables import markdown
+
+Scores = NDArray[np.float64]  # [seeds]
+
+NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
+SHOWN = {"lambda_init": "lambda from {}", "emotion_lr": "`emotion_lr` {}", "fear_start": "`fear_start` {}"}
+SHOWN |= {"regret_response": "`{}`"}
+LAST = 0.1  # share of the steps that count as the end
+
+
+def measures(run: runs.Run, until: float = np.inf) -> dict[str, Scores]:
+    """The three measures of each seed, up to a step: true cost at the end and while training, reward at the end.
+
+    Of a whole run they were stored from all rows; up to a step they come from the stored curves.
+    """
+    if until >= max(run["steps"]):
+        columns = {"end": "true cost", "training": runs.TRUE_WHILE_TRAINING, "reward": "reward"}
+        return {name: np.array(run["table"][column], float) for name, column in columns.items()}
+    log = runs.curves(run)
+    used = log.steps <= until
+    end = used & (log.steps > (1 - LAST) * log.steps[used][-1])
+
+    def mean(name: str, at: NDArray[np.bool_]) -> Scores:
+        values = log.metrics[name][:, at]
+        known = np.isfinite(values)
+        return np.where(known, values, 0.0).sum(1) / known.sum(1)
+
+    return {
+        "end": mean("true_episode_cost", end),
+        "training": 1000 * mean("true_step_cost", used),
+        "reward": mean("episode_reward", end),
+    }
+
+
+def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
+    """The method, with the settings in which the runs of `among` differ."""
+    name = NAMES[run["method"]]
+    mine = _settings(run)
+    differing = [
+        form.format(f"{mine[key]:g}" if isinstance(mine[key], float) else mine[key])
+        for key, form in SHOWN.items()
+        if any(repr(_settings(x)[key]) != repr(mine[key]) for x in among if x["method"] == run["method"])
+    ]
+    return ", ".join([name, *differing])
+
+
+def _settings(run: runs.Run) -> dict[str, Any]:
+    """The run's settings; those that are newer than it have their defaults."""
+    return {key: getattr(Config, key) for key in SHOWN} | runs.curves(run).settings
+
+
+def as_study(file: pathlib.Path) -> str:
+    """Question a: a row a cell, and F4SG's comparisons with the other methods of the same p."""
+    found = sorted(runs.load(file), key=lambda run: (-_share(run), list(NAMES).index(run["method"])))
+    scores = [measures(run) for run in found]
+    pairs = [(i, _fear_beside(found, run)) for i, run in enumerate(found) if _is_compared(run)]
+    corrected = {
+        name: holm([u_test(scores[j][name], scores[i][name]) for i, j in pairs])
+        for name in ("end", "training", "reward")
+    }
+    place = {i: k for k, (i, _) in enumerate(pairs)}
+    fear = dict(pairs)
+    head = ["p", "method", "true cost at the end", "interquartile mean [95 %]", "true cost per 1,000 steps, training"]
+    head += ["reward", "unsafe seeds", "P(F4SG lower)", "corrected p: end, training, reward"]
+    body = []
+    for i, (run, own) in enumerate(zip(found, scores, strict=True)):
+        low, high = iqm_interval(own["end"])
+        limit = run["cost_limit"] / _share(run)
+        line = [f"{_share(run):g}", label(run, [x for x in found if _share(x) == _share(run)])]
+        line += [_mean_sd(own["end"]), f"{iqm(own['end']):.1f} [{low:.1f}, {high:.1f}]", _mean_sd(own["training"])]
+        line += [_mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {len(own['end'])}"]
+        if i in fear:
+            wins = probability_of_improvement([own["end"]], [scores[fear[i]]["end"]])
+            line += [f"{wins:.2f}", ", ".join(_p(p[place[i]]) for p in corrected.values())]
+        else:
+            line += ["-", "-"]
+        body.append(line)
+    return markdown(head, body)
+
+
+def _share(run: runs.Run) -> float:
+    return runs.curves(run).settings["cost_seen"]
+
+
+def _is_compared(run: runs.Run) -> bool:
+    return run["method"] == "mappo_l" or (run["method"] != "f4sg" and _share(run) < 1)
+
+
+def _fear_beside(found: Sequence[runs.Run], run: runs.Run) -> int:
+    return next(i for i, other in enumerate(found) if other["method"] == "f4sg" and _share(other) == _share(run))
+
+
+def as_lag(file: pathlib.Path) -> str:
+    """Questions b and c, second part: each cell beside the reference cells, with Welch's interval of the difference.
+
+    Cells of question a that belong to it are read up to the last step of the cell beside them.
+    """
+    new = runs.load(file)
+    until = {run["task"]: max(run["steps"]) for run in new}
+    old = [
+        run
+        for name in ("study_ant_2x4_h200", "study_voltage_33_h200")
+        for run in runs.load(records.RESULTS / f"{name}.json")
+        if run["method"] in ("mappo_l", "f4sg", "r4sg") and runs.curves(run).settings["lambda_init"] < 4
+    ]
+    kept = {(run["task"], _share(run)) for run in new}
+    every = new + [run for run in old if (run["task"], _share(run)) in kept]
+    every.sort(key=lambda run: (run["task"], -_share(run), run["seeds"][0], list(NAMES).index(run["method"])))
+    head = ["task", "p", "method", "seeds from", "true cost per 1,000 steps, training", "less MAPPO-L's [95 %]"]
+    head += ["true cost at the end", "reward"]
+    body = []
+    for run in every:
+        own = measures(run, until[run["task"]])
+        base = _baseline(run, every)
+        less = "-" if base is None or base is run else _difference(own, measures(base, until[run["task"]]))
+        line = [
+            run["task"],
+            f"{_share(run):g}",
+            label(run, [x for x in every if x["task"] == run["task"]]),
+            str(run["seeds"][0]),
+            _mean_sd(own["training"]),
+            less,
+        ]
+        body.append([*line, _mean_sd(own["end"]), _mean_sd(own["reward"])])
+    return markdown(head, body)
+
+
+def _baseline(run: runs.Run, every: Sequence[runs.Run]) -> runs.Run | None:
+    """MAPPO-L at the same task and p, of the same seeds if there is one."""
+    same = [x for x in every if x["method"] == "mappo_l" and (x["task"], _share(x)) == (run["task"], _share(run))]
+    return next((x for x in same if x["seeds"][0] == run["seeds"][0]), same[0] if same else None)
+
+
+def _difference(own: dict[str, Scores], base: dict[str, Scores]) -> str:
+    middle, half = welch(own["training"], base["training"])
+    return f"{middle:+.1f} [{middle - half:.1f}, {middle + half:.1f}]"
+
+
+def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
+    """Difference of means of x [n] and y [m], and the half-width of Welch's interval."""
+    a, b = x.var(ddof=1) / x.size, y.var(ddof=1) / y.size
+    freedom = (a + b) ** 2 / (a**2 / (x.size - 1) + b**2 / (y.size - 1))
+    return float(x.mean() - y.mean()), float(scipy.special.stdtrit(freedom, (1 + level) / 2) * (a + b) ** 0.5)
+
+
+def as_equivalence(file: pathlib.Path) -> str:
+    """Question c, first part: R4SG less MAPPO-L at p = 1, beside half of MAPPO-L's standard deviation."""
+    cells = {run["method"]: measures(run) for run in runs.load(file) if _share(run) == 1}
+    body = []
+    for name, measure in {"reward": "reward", "true cost at the end": "end", "true cost, training": "training"}.items():
+        middle, half = welch(cells["r4sg"][measure], cells["mappo_l"][measure], level=0.9)
+        bound = float(cells["mappo_l"][measure].std(ddof=1)) / 2
+        inside = abs(middle) + half <= bound
+        p = u_test(cells["r4sg"][measure], cells["mappo_l"][measure])
+        answer = "equivalent" if inside else "different" if p < 0.05 else "not told apart"
+        body.append(
+            [name, f"{middle:+.1f} [{middle - half:.1f}, {middle + half:.1f}]", f"+- {bound:.1f}", _p(p), answer]
+        )
+    return markdown(["measure", "R4SG less MAPPO-L [90 %]", "bounds", "p", "answer"], body)
+
+
+def _mean_sd(x: Scores) -> str:
+    form = ".0f" if abs(x.mean()) >= 100 else ".1f"
+    return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
+
+
+def _p(value: float) -> str:
+    return "< .001" if value < 0.001 else f"{value:.3f}".lstrip("0") if value < 1 else "1"
+
+
+FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+    "study": as_study,
+    "lag": as_lag,
+    "equivalence": as_equivalence,
+}

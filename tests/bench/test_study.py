@@ -1,0 +1,71 @@
+"""The study's tables: measures and comparisons of stored runs."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from bench import study
+from bench.study import measures, welch
+
+
+def stored(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
+    """A run of three seeds and ten points whose true episode cost is constant."""
+    points, seeds = 10, len(true_cost)
+    config = {"cost_seen": seen, "cost_false": 0.0, "lambda_init": 2.0, "method": method} | settings
+    curve = {name: [[1.0] * points] * seeds for name in ("episode_reward", "episode_cost", "violation_rate", "lambda")}
+    return {
+        "steps": list(range(10, 110, 10)),
+        "seeds": list(range(seeds)),
+        **curve,
+        "episode_length": [[1.0] * points] * seeds,
+        "true_episode_cost": [[x] * points for x in true_cost],
+        "true_step_cost": [[x / 100] * points for x in true_cost],
+        "table": {
+            "reward": [1.0] * seeds,
+            "cost": [1.0] * seeds,
+            "true cost": true_cost,
+            "true cost per 1,000 steps while training": [10 * x for x in true_cost],
+        },
+        "source": "training",
+        "task": "lane",
+        "method": method,
+        "cost_limit": 5.0 * seen,
+        "seconds": 1.0,
+        "config": "\n".join(f"{k} = {json.dumps(v)}" for k, v in config.items()),
+    }
+
+
+def test_measures_up_to_a_step_come_from_the_curves():
+    run = stored("f4sg", 0.5, [4.0, 6.0, 5.0])
+    run["true_step_cost"] = [[0.1] * 5 + [0.0] * 5] * 3
+    assert measures(run)["training"].tolist() == [40.0, 60.0, 50.0]
+    np.testing.assert_allclose(measures(run, until=50)["training"], 100.0)
+    np.testing.assert_allclose(measures(run, until=99)["end"], [4.0, 6.0, 5.0])
+
+
+def test_the_table_compares_fear_with_the_others_of_the_same_share(tmp_path: pathlib.Path):
+    low, high = list(np.linspace(1, 2, 12)), list(np.linspace(8, 9, 12))
+    cells = [stored("f4sg", 0.5, low), stored("mappo_l", 0.5, high), stored("mappo_l", 0.5, high, lambda_init=4.0)]
+    file = tmp_path / "x.json"
+    file.write_text(json.dumps(cells))
+    lines = study.as_study(file).splitlines()[2:]
+    assert [line.split("|")[2].strip() for line in lines] == [
+        "MAPPO-L, lambda from 2",
+        "MAPPO-L, lambda from 4",
+        "F4SG",
+    ]
+    assert all("12 of 12" in line and "| 1.00 | < .001" in line for line in lines[:2])
+    assert "0 of 12" in lines[2] and lines[2].rstrip().endswith("| - | - |")
+
+
+def test_welch_is_scipys():
+    import scipy.stats
+
+    x, y = np.array([1.0, 2.0, 4.0, 9.0]), np.array([0.5, 1.0, 1.5])
+    expected = scipy.stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    middle, half = welch(x, y)
+    assert (middle - half, middle + half) == pytest.approx((expected.low, expected.high))
