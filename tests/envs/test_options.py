@@ -53,3 +53,11 @@ def test_a_spec_refuses_names_that_are_no_folders(name):
     with pytest.raises(TaskError, match="spec.name names folders"):
         dataclasses.replace(envs.make("lane").spec, name=name)
     assert isinstance(dataclasses.replace(envs.make("lane").spec, name="my-env_2.1+x"), EnvSpec)
+
+
+def test_a_spec_takes_one_limit_or_one_for_each_cost():
+    spec = dataclasses.replace(envs.make("lane").spec, num_costs=2)
+    assert dataclasses.replace(spec, cost_limit=(1.0, 2)).cost_limit == (1.0, 2)
+    for wrong in ((1.0,), (1.0, -1.0), float("nan"), "1", (1.0, "2")):
+        with pytest.raises(TaskError, match="spec.cost_limit must be a number of at least 0, or a tuple of 2"):
+            dataclasses.replace(spec, cost_limit=wrong)

@@ -97,9 +97,13 @@ GOOD = EXAMPLE.read_text()
         (
             GOOD.replace("cost_limit=2.0", "cost_limit='2'"),
             "",
-            "spec.cost_limit must be a number of at least 0, not '2'",
+            "spec.cost_limit must be a number of at least 0, or a tuple of 1 of them, not '2'",
         ),
-        (GOOD.replace("cost_limit=2.0", "cost_limit=-2"), "", "spec.cost_limit must be a number of at least 0, not -2"),
+        (
+            GOOD.replace("cost_limit=2.0", "cost_limit=-2"),
+            "",
+            "spec.cost_limit must be a number of at least 0, or a tuple of 1 of them, not -2",
+        ),
         (GOOD.replace("horizon=50", "horizon=0"), "", "spec.horizon must be a whole number of at least 1, not 0"),
         (GOOD.replace("horizon=50", "horizon=-3"), "", "spec.horizon must be a whole number of at least 1, not -3"),
         (GOOD.replace('name="pole"', 'name="../pole"'), "", "spec.name names folders: letters, digits"),
