@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from small import program
 
-from pmt_jax import load_config, make_setup
-from pmt_jax.learning import learner
-
-SMALL = {"num_envs": 8, "rollout_length": 25, "minibatches": 1, "epochs": 1, "hidden": (8,)}
-SETUP = make_setup(load_config("switch", "f4sg", **SMALL))
+PROGRAM = program("f4sg")
+SETUP = PROGRAM.setup
 STATES = jax.random.normal(jax.random.key(1), (50, SETUP.vector.spec.state_dim))
 
 
@@ -37,9 +33,7 @@ def test_a_first_batch_without_any_cost_leaves_fear_finite():
 
 
 def test_an_update_from_nan_is_finite_everywhere():
-    hyper = dataclasses.replace(SETUP.hyper, fear_start=jnp.asarray(jnp.nan))
-    state, metrics = jax.jit(lambda key: learner.train_step(SETUP, hyper, learner.init(SETUP, hyper, key)))(
-        jax.random.key(0)
-    )
+    hyper = PROGRAM.hyper(fear_start=jnp.nan)
+    state, metrics = PROGRAM.step(hyper, PROGRAM.init(hyper, jax.random.key(0)))
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.fear.params))
     assert jnp.isfinite(metrics["fear/loss"])
