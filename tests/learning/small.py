@@ -14,7 +14,7 @@ from pmt_jax import load_config, make_setup
 from pmt_jax.config.settings import HYPER_FIELDS, Hyper
 from pmt_jax.learning import learner
 from pmt_jax.learning.setup import Setup
-from pmt_jax.learning.types import Batch, LearnerState, Metrics
+from pmt_jax.learning.types import Batch, LearnerState, Metrics, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
 
@@ -55,7 +55,8 @@ def acted() -> tuple[Setup, LearnerState, Batch]:
     """A method with regret after its team has acted in `switch` for a batch."""
     made = program("r4sg")
     start = made.init(made.setup.hyper, jax.random.key(0))
-    state, batch = jax.jit(functools.partial(learner._act, made.setup))(start, jax.random.key(1))
+    tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
+    state, batch = jax.jit(functools.partial(learner._act, made.setup))(made.setup.hyper, start, tagged)
     return made.setup, state, batch
 
 

@@ -36,22 +36,24 @@ class TwoDangers(Lane):
 # One program
 
 
-def test_a_trial_among_others_is_that_trial_alone():
-    """Three seeds with a multiplier's learning rate each, in one program."""
+def test_a_trial_does_not_feel_the_others_of_its_program():
+    """Three seeds with a multiplier's learning rate each."""
     config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 400})
-    train, base = make_train(config), make_setup(config).hyper
-    keys = jax.random.split(jax.random.key(0), 3)
-    hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
-    hyper = dataclasses.replace(hyper, lambda_lr=jnp.asarray([0.0, 0.1, 1.0]))
-    states, metrics = jax.jit(jax.vmap(train))(keys, hyper)
+    train, base = jax.jit(jax.vmap(make_train(config))), make_setup(config).hyper
+
+    def trained(seeds: list[int], rates: list[float]):
+        hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
+        hyper = dataclasses.replace(hyper, lambda_lr=jnp.asarray(rates))
+        return train(jax.vmap(jax.random.key)(jnp.asarray(seeds)), hyper)
+
+    states, metrics = trained([0, 0, 2], [0.0, 0.1, 1.0])
     np.testing.assert_allclose(states.multiplier[0], 0.78)
     assert jnp.abs(states.multiplier[1] - states.multiplier[2]).max() > 1e-3
-    kernels = np.asarray(jax.tree.leaves(states.actor.params)[-1]).reshape(3, -1)
-    assert len(np.unique(kernels, axis=0)) == 3
-
-    alone, alone_metrics = jax.jit(train)(*jax.tree.map(lambda x: x[2], (keys, hyper)))
-    third = jax.tree.map(lambda x: x[2], (weights(states), metrics))
-    chex.assert_trees_all_close(third, (weights(alone), alone_metrics), rtol=1e-4, atol=1e-5)
+    kernels = np.asarray(jax.tree.leaves(states.actor.params)[-1])
+    assert np.abs(kernels[0] - kernels[2]).max() > 1e-2
+    others = trained([5, 6, 2], [0.3, 3.0, 1.0])
+    third = [jax.tree.map(lambda x: x[2], (weights(state), figures)) for state, figures in ((states, metrics), others)]
+    chex.assert_trees_all_equal(*third)
 
 
 @pytest.mark.full
@@ -86,6 +88,7 @@ def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str
         assert not y.weak_type and not x.weak_type
 
 
+@pytest.mark.full
 def test_two_costs_have_a_multiplier_each():
     setup = make_setup(load_config("lane", method="mappo_l", **SMALL), TwoDangers())
     step = jax.jit(lambda key: learner.train_step(setup, setup.hyper, learner.init(setup, setup.hyper, key))[0])
