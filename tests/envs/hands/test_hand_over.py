@@ -17,9 +17,6 @@ from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
 from places import ROOT
-from pmt_jax import load_config, make_setup
-from pmt_jax.learning import emotions, learner
-from pmt_jax.learning.types import Tag
 
 CATCH = ROOT / "bench" / "results" / "hand_over_catch.json"
 COUNT = 1000  # starts of the session's batch; the action 0 is the middle of all ranges, a half-flexed hand
@@ -357,27 +354,6 @@ def test_the_egg_can_be_handed_over():
     after = episodes(env, jnp.broadcast_to(actions, (75, 3, 2, 20)), first)
     assert (after.reward.sum(axis=0) > 16).all() and not after.cost.any()
     assert (after.info["distance"][-1] < 0.05).all()
-
-
-def test_fear_finds_the_action_that_costs():
-    """The cost is a function of one action entry, which stands among the 398 of the next state.
-
-    After 60 passes over a batch, fear of another batch is 0.?? +- 0.?? higher where it costs (10 seeds).
-    """
-    sizes = {"num_envs": 64, "rollout_length": 25, "minibatches": 8, "hidden": (64,), "emotion_epochs": 60}
-    setup = make_setup(load_config("hand_over_2x6", "f4sg", emotion_lr=3e-3, **sizes))
-
-    @jax.jit
-    def fears(key):
-        start = learner.init(setup, setup.hyper, key)
-        state, known = learner._act(setup, setup.hyper, start, dict.fromkeys(Tag, key))
-        _, other = learner._act(setup, setup.hyper, state, dict.fromkeys(Tag, state.key))
-        fear, _, _ = emotions.appraise_fear(setup, setup.hyper, state.fear, known, key)
-        return emotions.calibration(jax.nn.sigmoid(setup.nets.fear(fear.params, other.next_state)), other.cost)
-
-    found = fears(jax.random.key(0))
-    print(found)
-    assert found["on_costly"] - found["on_safe"] > 0.1
 
 
 def test_decoration_shows_the_goal_and_reddens_the_finger_only_when_it_costs():
