@@ -234,13 +234,12 @@ def test_profiles_in_the_package() -> None:
     for name, task in (("case33", "voltage_33"), ("case141", "voltage_141")):
         for data in ("simbench", "synthetic:3"):
             env = envs.make(task, data=data)
-            table, profiles = env.scenario.table, env.profiles
+            table, found = env.scenario.table, env.profiles
             np.testing.assert_allclose(env.s_max, table["s_max"], rtol=1e-6)
-            assert profiles.days >= 365 and profiles.pv.min() == 0
-            peak = profiles.p_load.sum(axis=1).max()
-            assert peak == pytest.approx(profiles.PEAK_LOAD[data.split(":")[0], name])
+            assert found.days >= 365 and found.pv.min() == 0
+            assert found.p_load.sum(axis=1).max() == pytest.approx(profiles.PEAK_LOAD[data.split(":")[0], name])
     again = profiles.synthetic_profiles("case141", table, seed=3)
-    np.testing.assert_array_equal(again.p_load, profiles.p_load)
+    np.testing.assert_array_equal(again.p_load, found.p_load)
 
 
 def test_rows_between_knots_are_on_straight_lines(tmp_path: Path) -> None:
