@@ -52,7 +52,8 @@ def test_killed_and_out_of_disk(whole: pathlib.Path, disk: tuple[pathlib.Path, b
     kill(whole, STEPS, disk, times=2, seed=5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
-def test_killed_two_hundred_times(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
+@pytest.mark.parametrize(
+    "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(10)]
+)
+def test_killed_twenty_times(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
     kill(unbroken, LONG, disk, times=20, seed=seed)
