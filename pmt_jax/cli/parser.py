@@ -21,7 +21,8 @@ class Parser(argparse.ArgumentParser):
     """Raises one sentence, with the nearest known word, instead of printing its usage and exiting."""
 
     def error(self, message: str) -> NoReturn:
-        fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)  # from a type below
+        """Raises argparse's message, or the sentence of one of the types below."""
+        fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)
         raise UsageError(f"{fault[1]} {fault[2]}" if fault else f"{message} (see {self.prog} --help)")
 
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:

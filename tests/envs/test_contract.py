@@ -15,6 +15,7 @@ import pytest
 import envs
 from envs.base import Env, State
 from envs.vector import VectorEnv
+from pmt_jax.config import toml
 
 BATCH = 4
 # Variants differ from hand_over_2x6 in numbers only, which hands/test_hand_over.py holds.
@@ -53,6 +54,13 @@ def actions(name: str, seed: int = 1) -> jax.Array:
 
 def raw_data(tree):
     return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
+
+
+@each_task()
+def test_its_configuration_describes_it(name: str):
+    spec = made(name).spec
+    for fact in (f" {spec.num_agents} agents", f" {spec.horizon} steps", f"limit {spec.cost_limit:g}"):
+        assert fact in toml.about(name)
 
 
 @each_task()
