@@ -80,7 +80,7 @@ def _say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
     whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
     say(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
-    metrics = {name: x for name, x in row.items() if isinstance(x, tuple)}
+    metrics = {name: x for name, x in row.items() if isinstance(x, tuple) and name != "cost_limit"}
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
         say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
