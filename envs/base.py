@@ -161,7 +161,7 @@ class NetworkMap:
     Attributes:
       raw: its `quantity` [n] colours the nodes.
       quantity: the name.
-      band: the quantity's lower and upper bound.
+      band: the quantity's lower and upper bound; unit: of the quantity.
       x, y: [n] places of the nodes, 0 to 1.
       links: [b, 2] the nodes that each line joins.
       agents: [N] the agents' nodes.
@@ -174,6 +174,7 @@ class NetworkMap:
     y: np.ndarray
     links: np.ndarray
     agents: np.ndarray
+    unit: str = ""
     kind: ClassVar[str] = "map"
 
 

@@ -224,7 +224,9 @@ class VoltageControl:
         links = np.array([pair if x[pair[0]] <= x[pair[1]] else pair[::-1] for pair in np.asarray(network.branch_bus)])
         band = self.v_lower, self.v_upper
         return Declarations(
-            picture=NetworkMap(self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"])),
+            picture=NetworkMap(
+                self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"]), unit="p.u."
+            ),
             baselines={name: functools.partial(make, self) for name, make in POLICIES.items()},
         )
 

@@ -36,7 +36,8 @@ def evaluate(
       hyper: says what of the costs is felt; the setup's own if None.
 
     Returns:
-      The metrics of `play`.
+      The metrics of `play`, and within_limit [episodes]: whether an episode's cost (the true one, of several each felt
+      one) is within its limit.
     """
     felt = setup.hyper if hyper is None else hyper
     key = jax.random.key(EVALUATION_KEY)
@@ -50,7 +51,15 @@ def evaluate(
         step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
         return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
 
-    return play(setup.vector.env, act, episodes, feel)
+    metrics = play(setup.vector.env, act, episodes, feel)
+    count = setup.vector.spec.num_costs
+    costs = (
+        [metrics[f"episode_cost/{k}"] for k in range(count)]
+        if count > 1
+        else [metrics["true_episode_cost"] * felt.cost_seen]
+    )
+    within = jnp.all(jnp.stack(costs, axis=-1) <= felt.cost_limit, axis=-1)
+    return metrics | {"within_limit": within.astype(costs[0].dtype)}
 
 
 def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost) -> Metrics:

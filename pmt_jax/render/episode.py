@@ -29,7 +29,8 @@ class Episode:
       step: [T + 1] control steps since the reset.
       reward, cost: [T + 1] of the step that led to each moment; cost is the mean over agents, summed over costs.
       reward_sum, cost_sum: [T + 1] of the episode so far.
-      info: {name: [T + 1]} the task's figures.
+      info: {name: [T + 1]} the task's metrics.
+      action: [T + 1, N, A] that led to each moment; 0 at the reset.
     """
 
     env: tasks.Env
@@ -43,6 +44,7 @@ class Episode:
     reward_sum: np.ndarray
     cost_sum: np.ndarray
     info: dict[str, np.ndarray]
+    action: np.ndarray
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -58,7 +60,7 @@ class Episode:
 
     def cut(self, moments: slice) -> Episode:
         """The part of it that pictures shall show; a cost between two moments counts at the later one."""
-        names = ("raw", "step", "reward", "reward_sum", "cost_sum", "info")
+        names = ("raw", "step", "reward", "reward_sum", "cost_sum", "info", "action")
         arrays = jax.tree.map(lambda x: x[moments], {name: getattr(self, name) for name in names})
         kept = np.arange(len(self))[moments]
         since = np.concatenate([kept[:1], kept[:-1] + 1])
@@ -92,27 +94,29 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
       number: [] which of the fixed starts.
 
     Returns:
-      raw, reward, cost, info, terminated with a leading [horizon + 1]; see `Episode`.
+      raw, reward, cost, info, action, terminated with a leading [horizon + 1]; see `Episode`.
     """
     env = setup.vector.env
     mask, picture = jnp.asarray(env.spec.action_mask), tasks.declarations(env).picture
     start_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(EVALUATION_KEY), number))
 
-    def moment(s: tasks.State) -> dict[str, Any]:
+    def moment(s: tasks.State, action: jax.Array) -> dict[str, Any]:
         found = picture.raw(s)
         raw = {k: x for k, x in found.items() if x is not None and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)}
         cost = s.cost.sum(-1).mean()
-        return {"raw": raw, "reward": s.reward, "cost": cost, "info": s.info, "terminated": s.terminated}
+        step = {"reward": s.reward, "cost": cost, "info": s.info, "action": action, "terminated": s.terminated}
+        return {"raw": raw, **step}
 
     def step(s: tasks.State, t: jax.Array) -> tuple[tasks.State, dict[str, Any]]:
         mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, s.obs[None]))
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(noise_key, t), mean.shape)
-        after = env.step(s, (mean + std * noise)[0] * mask)
-        return after, moment(after)
+        action = (mean + std * noise)[0] * mask
+        after = env.step(s, action)
+        return after, moment(after, action)
 
     start = env.reset(start_key)
     _, later = jax.lax.scan(step, start, jnp.arange(setup.vector.horizon))
-    return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), moment(start), later)
+    return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), moment(start, 0 * mask), later)
 
 
 def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:

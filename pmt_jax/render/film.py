@@ -1,27 +1,25 @@
 """`pmt render`: an episode as a film (MP4, GIF) or as a page that replays it (HTML)."""
 
-# mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import contextlib
-import importlib
+import html
 import pathlib
 import subprocess
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 
 from ..errors import UsageError, optional
 from ..files import writing
-from . import gl, grid_map, page
+from . import network_map, page
 from .episode import Episode, record_run
+from .network_map import INK, PAPER
 
 FORMATS = (".mp4", ".gif", ".html")
 SIZE = (640, 360)  # pixels
 COLOURS = 48  # of a GIF
-DANGER, PAPER, INK = (200, 64, 47), (251, 250, 248), (29, 33, 37)
+DANGER = (200, 64, 47)
 
 
 def render(
@@ -63,95 +61,24 @@ def render(
     with writing(out) as partial:
         if out.suffix == ".html":
             title = f"{task}, {episode.method}"
-            head = f"<h1>{title}</h1><p>One episode, seed {episode.seed}; red marks the steps that cost.</p>"
+            head = (
+                f"<h1>{html.escape(title)}</h1><p>One episode, seed {episode.seed}; red marks the steps that cost.</p>"
+            )
             partial.write_text(page.page(title, [head, page.replay(episode, fps)]))
         else:
             _write_film(_captioned(episode, _frames(episode, size)), partial, fps, size)
-    say(f"wrote {out}: {len(episode) - 1} control steps of {task}, {costly} of them with a cost")
+    say(f"wrote {out}: {np.count_nonzero(episode.step)} control steps of {task}, {costly} of them with a cost")
 
 
 def _frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """[height, width, 3] pictures of an episode's moments."""
-    if episode.picture.kind == "scene":
-        return _bodies(episode, size, gl.choose())
+    if episode.picture.kind == "plain":
+        raise UsageError(f"task '{episode.env.spec.name}' has no film; write a page instead: -o replay.html")
     if episode.picture.kind == "map":
-        return _maps(episode, size)
-    raise UsageError(f"task '{episode.env.spec.name}' has no film; write a page instead: -o replay.html")
+        return network_map.frames(episode, size)
+    from . import scenes  # MuJoCo, which only its tasks need
 
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Bodies, drawn by MuJoCo
-
-
-def _bodies(episode: Episode, size: tuple[int, int], platform: str) -> Iterator[np.ndarray]:
-    import mujoco
-
-    from . import scenes
-
-    model = episode.picture.model
-    width, height = size
-    window = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
-    window.make_current()
-    before = model.vis.global_.offwidth, model.vis.global_.offheight
-    model.vis.global_.offwidth, model.vis.global_.offheight = size
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    model.vis.global_.offwidth, model.vis.global_.offheight = before
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-    area = mujoco.MjrRect(0, 0, width, height)
-    picture = np.zeros((height, width, 3), np.uint8)
-    try:
-        for scene in scenes.scenes(episode):
-            mujoco.mjr_render(area, scene, context)
-            mujoco.mjr_readPixels(picture, None, area, context)
-            yield picture[::-1]
-    finally:
-        context.free()
-        window.free()
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The voltage map, drawn by matplotlib
-
-
-def _maps(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
-
-    grid = episode.picture
-    x, y, (low, high), values = grid.x, -grid.y, grid.band, episode.raw[grid.quantity]
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="#{:02x}{:02x}{:02x}".format(*PAPER))
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.03, 0.22, 0.94, 0.72), frameon=False, xticks=[], yticks=[])
-    area = 40 * min(1, 45 / len(x))  # points^2 of a bus
-    rim = area**0.5 / 3
-    elbows = [[(x[a], y[a]), (x[a], y[b]), (x[b], y[b])] for a, b in grid.links]
-    lines: Any = axes.add_collection(LineCollection(elbows, linewidths=area**0.5 / 2.5, zorder=1))
-    marks = np.isin(np.arange(len(x)), grid.agents)
-    looks = ((~marks, area, "o"), (marks, 1.75 * area, "s"))
-    buses: list[Any] = [axes.scatter(x[m], y[m], s=s, marker=k, zorder=2) for m, s, k in looks]
-    _colour_bar(figure, grid.band)
-    for v in values:
-        lines.set_color(grid_map.voltage_colours(v[grid.links].mean(1), grid.band))
-        for dots, chosen in zip(buses, (~marks, marks), strict=True):
-            out = (v[chosen] < low) | (v[chosen] > high)
-            dots.set_facecolor(grid_map.voltage_colours(v[chosen], grid.band))
-            dots.set_edgecolor(np.where(out[:, None], np.array(INK) / 255, np.array(PAPER) / 255))
-            dots.set_linewidth(np.where(out, rim, 0.4 * rim))
-        canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())[..., :3]
-
-
-def _colour_bar(figure: Any, band: tuple[float, float]) -> None:
-    """Beneath the map: which colour means which voltage, the band marked."""
-    low, high = band
-    reach = np.linspace(low - (high - low) / 2, high + (high - low) / 2, 200)
-    axes = figure.add_axes((0.56, 0.175, 0.4, 0.025))
-    axes.imshow(grid_map.voltage_colours(reach, band)[None], aspect="auto", extent=(reach[0], reach[-1], 0, 1))
-    axes.set(yticks=[], xticks=[low, (low + high) / 2, high])
-    axes.set_xticklabels([f"{low:g}", f"{(low + high) / 2:g} p.u.", f"{high:g}"], fontsize=8)
-    axes.tick_params(length=2, pad=1)
-    axes.set_frame_on(False)
+    return scenes.frames(episode, size)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

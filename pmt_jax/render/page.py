@@ -6,6 +6,7 @@ import base64
 import html
 import importlib.resources
 import json
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from .episode import Episode
 
+NUMBER = re.compile(r"[-+]?(\d|$)")  # the beginning of one, or - for none
 RATE = 20.0  # control steps that a replay shows a second
 
 
@@ -33,7 +35,7 @@ def _asset(name: str) -> str:
 
 
 def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
-    """An episode as a figure that plays: bodies in space, a voltage map, or the task's figures over time.
+    """An episode as a figure that plays: bodies in space, a network map, or metrics and actions over time.
 
     Args:
       rate: control steps a second.
@@ -58,8 +60,8 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
     elif kind == "map":
         data["map"] = _map(episode)
     else:
-        data["info"] = {name: _numbers(x) for name, x in episode.info.items()}
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+        data["panels"] = _panels(episode)
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # a name cannot end the script
     starts = "yes" if play else "no"
     return (
         f'<figure class="replay" data-kind="{kind}" data-play="{starts}">\n'
@@ -76,8 +78,21 @@ def _map(episode: Episode) -> dict[str, Any]:
         "links": grid.links.tolist(),
         "agents": grid.agents.tolist(),
         "band": list(grid.band),
+        "unit": grid.unit,
         "values": to_base64(episode.raw[grid.quantity]),
     }
+
+
+def _panels(episode: Episode) -> list[dict[str, Any]]:
+    """Metrics and actions over time, for a task without a picture: name and lines [T + 1] of each panel."""
+    sums = {"reward so far": episode.reward_sum, "cost so far": episode.cost_sum}
+    panels = [{"name": name, "lines": [_numbers(x)]} for name, x in {**sums, **episode.info}.items()]
+    for agent, (actions, mask) in enumerate(
+        zip(episode.action.swapaxes(0, 1), episode.env.spec.action_mask, strict=True)
+    ):
+        lines = [_numbers(x) for x, used in zip(actions.T, mask, strict=True) if used]
+        panels.append({"name": f"actions of agent {agent}", "lines": lines})
+    return panels
 
 
 def to_base64(x: np.ndarray) -> str:
@@ -90,12 +105,14 @@ def _numbers(x: np.ndarray) -> list[float]:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table that scrolls by itself where it is wider than the screen; cells after the first hold numbers."""
+    """A table that scrolls by itself where it is wider than the screen; columns of numbers are aligned to the right."""
+    lines = [list(row) for row in rows]
+    numeric = [i > 0 and all(NUMBER.match(row[i]) for row in lines) for i in range(len(head or lines[0]))]
 
     def line(cells: Sequence[str], tag: str) -> str:
-        kinds = ["", *[' class="number"'] * (len(cells) - 1)]
+        kinds = [' class="number"' * number for number in numeric]
         return "".join(f"<{tag}{k}>{html.escape(c)}</{tag}>" for k, c in zip(kinds, cells, strict=True))
 
     top = f"<thead><tr>{line(head, 'th')}</tr></thead>" if head else ""
-    body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in rows)
-    return f'<div class="wide"><table>{top}<tbody>{body}</tbody></table></div>'
+    body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in lines)
+    return f'<div class="wide" tabindex="0"><table>{top}<tbody>{body}</tbody></table></div>'

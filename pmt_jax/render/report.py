@@ -11,7 +11,8 @@ from typing import Any
 from ..errors import UsageError
 from ..files import writing
 from ..policies import evaluate
-from ..studies import plot
+from ..studies import plot, table
+from ..studies.rows import rows
 from ..studies.run_log import Group, RunLog, read_all
 from . import episode, page
 
@@ -38,7 +39,7 @@ def report(
         raise UsageError(f"cannot write {out}: the ending of a report must be .html")
     logs = read_all(folders, say)
     title = _title(logs)
-    body = [*_heading(title, logs), *_curve_sections(plot.pooled(logs, say))]
+    body = [*_heading(title, logs), *_or_reason(lambda: _table(logs)), *_curve_sections(plot.pooled(logs, say))]
     for log in logs:
         say(f"evaluating {log.folder} ...")
         body += _run_section(log, episodes)
@@ -55,6 +56,17 @@ def _heading(title: str, logs: Sequence[RunLog]) -> list[str]:
     seeds = sum(len(log.seeds) for log in logs)
     many = f"{len(logs)} run{'s' * (len(logs) != 1)}, {seeds} seed{'s' * (seeds != 1)} in all."
     return [f"<h1>{html.escape(title)}</h1>", f"<p>{many} Made by pmt report.</p>"]
+
+
+def _table(logs: Sequence[RunLog]) -> list[str]:
+    """What `pmt table` says of the runs."""
+    head, lines, notes = table.cells(rows(logs, note=lambda _: None))
+    explained = f"<details><summary>What the columns mean</summary><p>{html.escape(' '.join(notes))}</p></details>"
+    return ["<h2>Scores</h2>", page.table([*head[1:2], *head[:1], *head[2:]], _method_first(lines)), explained]
+
+
+def _method_first(lines: Sequence[Sequence[str]]) -> list[list[str]]:
+    return [[line[1], line[0], *line[2:]] for line in lines]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -93,11 +105,11 @@ def _key(group: Group, look: plot.Look) -> str:
 
 
 def _run_section(log: RunLog, episodes: int) -> list[str]:
+    played = _or_reason(lambda: _evaluation(log.folder, episodes)) + _or_reason(lambda: _replay(log.folder))
     return [
         f"<section>\n<h2>{html.escape(log.folder.name)}</h2>",
         f"<p>{html.escape(_summary(log))}</p>",
-        *_or_reason(lambda: _evaluation(log.folder, episodes)),
-        *_or_reason(lambda: _replay(log.folder)),
+        *dict.fromkeys(played),  # what both lack is told once
         *_details("Settings", log.settings),
         *_details("Versions", log.versions),
         "</section>",
@@ -125,20 +137,23 @@ def _or_reason(make: Callable[[], list[str]]) -> list[str]:
 def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
     kinds = {"sampled": False, "mean": True}
     found = {kind: evaluate.evaluate_run(folder, episodes, mean) for kind, mean in kinds.items()}
-    rows = [(kind, row) for kind in kinds for row in found[kind]]
-    main = [name for name in ("episode_reward", "episode_cost", "violation_rate") if name in rows[0][1]]
-    others = [name for name, x in rows[0][1].items() if isinstance(x, tuple) and name not in main]
+    results = [(kind, row) for kind in kinds for row in found[kind]]
+    first = results[0][1]
+    main = [name for name in ("episode_reward", "episode_cost", "within_limit", "violation_rate") if name in first]
+    others = [name for name, x in first.items() if isinstance(x, tuple) and name not in main]
 
-    def table(names: Sequence[str]) -> str:
-        cells = ([f"seed {row['seed']}, {kind}", *(_with_interval(row[name]) for name in names)] for kind, row in rows)
+    def listing(names: Sequence[str]) -> str:
+        cells = (
+            [f"seed {row['seed']}, {kind}", *(_with_interval(row[name]) for name in names)] for kind, row in results
+        )
         heads = (name.removeprefix("info/").removeprefix("episode_").replace("_", " ") for name in names)
         return page.table(["policy", *heads], cells)
 
     return [
         f"<h3>Evaluation</h3><p>{episodes} whole episodes a seed from fixed starts, actions sampled or the mean; "
         "mean and half-width of its 95 % interval.</p>",
-        table(main),
-        f"<details><summary>All metrics of the task</summary>{table(others)}</details>" if others else "",
+        listing(main),
+        f"<details><summary>All metrics of the task</summary>{listing(others)}</details>" if others else "",
     ]
 
 
@@ -158,5 +173,5 @@ def _replay(folder: pathlib.Path) -> list[str]:
 def _details(title: str, values: dict[str, Any]) -> list[str]:
     if not values:
         return []
-    rows = page.table([], [(name, str(value)) for name, value in values.items()])
-    return [f"<details><summary>{title}</summary>{rows}</details>"]
+    lines = page.table([], [(name, str(value)) for name, value in values.items()])
+    return [f"<details><summary>{title}</summary>{lines}</details>"]

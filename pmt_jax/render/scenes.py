@@ -1,15 +1,17 @@
-"""An episode of MuJoCo bodies as scenes: geoms in space, moment by moment. Needs no graphics library."""
+"""An episode of MuJoCo bodies as scenes: geoms in space, moment by moment; only films of them need OpenGL."""
 
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from . import gl
 from .episode import Episode
 from .page import to_base64
 
@@ -129,3 +131,31 @@ def pack(x: np.ndarray) -> dict[str, Any]:
         "moving": np.flatnonzero(moves).tolist(),
         "frames": to_base64(x[:, moves]),
     }
+
+
+def frames(episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """[height, width, 3] pictures of an episode's moments, drawn by MuJoCo.
+
+    Raises:
+      UsageError: no OpenGL works here.
+    """
+    platform = gl.choose()
+    model = episode.picture.model
+    width, height = size
+    window = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
+    window.make_current()
+    before = model.vis.global_.offwidth, model.vis.global_.offheight
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    model.vis.global_.offwidth, model.vis.global_.offheight = before
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    area = mujoco.MjrRect(0, 0, width, height)
+    picture = np.zeros((height, width, 3), np.uint8)
+    try:
+        for scene in scenes(episode):
+            mujoco.mjr_render(area, scene, context)
+            mujoco.mjr_readPixels(picture, None, area, context)
+            yield picture[::-1]
+    finally:
+        context.free()
+        window.free()

@@ -108,5 +108,5 @@ def _improvements(ours: Sequence[Row], theirs: Sequence[Row], columns: tuple[str
 
 def _scores(rows: Sequence[Row], column: str) -> list[np.ndarray] | None:
     """The seeds' scores of each row; None where one has none."""
-    found = [row.scores.get(column, np.array([np.nan])) for row in rows]
+    found = [row.score(column) for row in rows]
     return found if all(np.isfinite(scores).all() for scores in found) else None

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..config.methods import METHODS
 from ..errors import UsageError
 from ..files import writing
 from ..tasks import columns
-from .rows import same
+from .rows import in_order, same
 from .run_log import Group, RunLog, Say, groups, read_all
 
 POINTS = 100  # of a curve
@@ -40,16 +39,17 @@ EMOTIONS = {
 COSTS = ("episode_cost", "true_episode_cost")
 
 # Okabe and Ito's colours, which the colour-blind tell apart, on white and on black; one for each method, everywhere.
-GREY, SKY, PURPLE, BLUE, RED, GREEN, ORANGE = (
-    "#7f7f7f",
-    "#56b4e9",
-    "#cc79a7",
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#e69f00",
-)
-METHOD_COLOURS = dict(zip(METHODS, (GREY, SKY, PURPLE, BLUE, RED, GREEN, ORANGE), strict=True))
+BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
+PURPLE, SKY, GREY = "#cc79a7", "#56b4e9", "#7f7f7f"
+METHOD_COLOURS = {
+    "mappo": GREY,
+    "happo": SKY,
+    "mappo_l": BLUE,
+    "macpo": PURPLE,
+    "f4sg": RED,
+    "r4sg": GREEN,
+    "mixed": ORANGE,
+}
 OTHER_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, GREY)  # of settings of one method, of methods not in METHODS
 DASHES = ("", "6 2", "1.5 2", "6 2 1.5 2")  # in line widths, as SVG has them
 MOST_BANDS = 3  # curves in a panel; more are lines, with the spread over seeds beside them
@@ -79,8 +79,8 @@ def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = 
 
 
 def pooled(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
-    """Runs that are the same up to seeds, their curves averaged into at most POINTS points."""
-    return groups([log.thinned(POINTS) for log in logs], note or print)
+    """Runs that are the same up to seeds, as METHODS is, their curves averaged into at most POINTS points."""
+    return in_order(groups([log.thinned(POINTS) for log in logs], note or print))
 
 
 def looks(shown: Sequence[Group]) -> list[Look]:
@@ -161,7 +161,7 @@ def draw(shown: Sequence[Group], out: pathlib.Path) -> None:
     tasks = {task: [g for g in shown if g.task == task] for task in dict.fromkeys(g.task for g in shown)}
     sizes = [_size(groups) for groups in tasks.values()]
     wide = max(width for width, _ in sizes)
-    with rc_context({"font.size": 9, "svg.fonttype": "none"}), writing(out) as partial:
+    with rc_context({"font.size": 9, "svg.fonttype": "none", "text.parse_math": False}), writing(out) as partial:
         figure = Figure(figsize=(wide, sum(height for _, height in sizes)), layout="constrained")
         parts = figure.subfigures(len(tasks), 1, squeeze=False, height_ratios=[height for _, height in sizes])[:, 0]
         for part, (task, groups) in zip(parts, tasks.items(), strict=True):
@@ -219,7 +219,7 @@ def _panel(axis: Any, shown: Sequence[Group], name: str, title: str) -> None:
     axis.set_xlabel("environment steps of a seed", fontsize=8)
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= 1.01 * end])
-    axis.grid(alpha=0.25, lw=0.6)
+    axis.grid(alpha=0.18, lw=0.6)
     axis.spines[["top", "right"]].set_visible(False)
 
 
@@ -247,7 +247,7 @@ def _cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
         axis.yaxis.set_major_locator(FixedLocator(ticks))
         axis.yaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_major_formatter("{x:g}")
-        axis.set_ylabel("linear up to the limit, then logarithmic", fontsize=7)
+        axis.set_ylabel("linear up to the limit,\nlogarithmic beyond", fontsize=7)
         axis.set_ylim(top=max(top, ticks[-1]) * 1.1)
     axis.set_ylim(bottom=0)
 
@@ -268,6 +268,7 @@ def inline(shown: Sequence[Group], name: str, title: str) -> str:
 
     inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
     style: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": f"{shown[0].task} {name}", "font.size": 10}
+    style["text.parse_math"] = False  # a $ in a name is a $
     with rc_context(dict.fromkeys(inks, INK) | style):
         figure = Figure(figsize=(3.6, 2.5), layout="constrained", facecolor="none")
         axis = figure.subplots()

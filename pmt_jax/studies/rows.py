@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..config.methods import METHODS
 from ..errors import UsageError
 from ..tasks import columns as task_columns
 from . import statistics
-from .run_log import Group, RunLog, groups
+from .run_log import Group, RunLog, Say, groups
 
 
 class Column(NamedTuple):
@@ -45,6 +45,9 @@ COLUMNS = (
     Column("true cost", "true_episode_cost", 0, note="true: with the costs that the team did not feel"),
     Column("true violation rate", "true_violation_rate", 0, 1),
     Column("true step cost", "true_step_cost", 0),
+    Column(
+        "episodes within", "within_limit", 0, 1, "episodes within: share of episodes whose cost is within the limit"
+    ),
 )
 
 
@@ -61,10 +64,11 @@ class Row:
 
     Attributes:
       task, method: their names; settings: what differs from other rows of the same task, as `name=value`.
-      cost_limit: allowed cost of one agent per episode; true_limit: the same of true costs (see `cost_seen`).
+      cost_limit: allowed cost of one agent per episode.
       steps: environment steps per seed (the fewest, where runs differ).
       source: `evaluation` or `training`, what the scores are taken from.
       scores: {column: [seeds]} in the task's units; nan where a seed has none.
+      excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` where None.
     """
 
     task: str
@@ -74,13 +78,17 @@ class Row:
     steps: int
     source: str
     scores: dict[str, np.ndarray]
-    true_limit: float = math.nan
+    excess: np.ndarray | None = None
+
+    def score(self, column: str) -> np.ndarray:
+        """[seeds] of a column, nan where the row does not have it."""
+        nothing = np.full(len(next(iter(self.scores.values()), [0])), np.nan)
+        return self.scores.get(column, nothing)
 
     @property
-    def within(self) -> np.ndarray:
-        """[seeds] bool: its cost is within the limit, the true one where it is known."""
-        true = "true cost" in self.scores and not math.isnan(self.true_limit)
-        return self.scores["true cost"] <= self.true_limit if true else self.scores["cost"] <= self.cost_limit
+    def beyond(self) -> np.ndarray:
+        """[seeds] cost beyond the limit, of several costs the worst; below 0 within it."""
+        return self.score("cost") - self.cost_limit if self.excess is None else self.excess
 
     @property
     def label(self) -> str:
@@ -90,22 +98,27 @@ class Row:
     @property
     def rank(self) -> tuple[bool, float]:
         """Sorts the best first: by reward within the cost limit, then by cost beyond it; nan last."""
-        reward, cost = (statistics.iqm(self.scores[name]) for name in ("reward", "cost"))
-        safe = cost <= self.cost_limit
-        key = -reward if safe else cost
-        return (not safe, math.inf if math.isnan(key) else key)
+        reward, beyond = statistics.iqm(self.score("reward")), statistics.iqm(self.beyond)
+        key = -reward if beyond <= 0 else beyond
+        return (not beyond <= 0, math.inf if math.isnan(key) else key)
 
 
-def rows(logs: Sequence[RunLog]) -> list[Row]:
+RowOrGroup = TypeVar("RowOrGroup", Row, Group)
+
+
+def rows(logs: Sequence[RunLog], note: Say | None = None) -> list[Row]:
     """One row per task, method and settings, in the order of the tasks' names and of METHODS.
+
+    Args:
+      note: as for `run_log.groups`.
 
     Raises:
       UsageError: two runs of one row have trained the same seed, or only one of them was evaluated.
     """
-    return in_order([_row(group) for group in groups(logs)])
+    return in_order([_row(group) for group in groups(logs, note)])
 
 
-def in_order(rows: Sequence[Row]) -> list[Row]:
+def in_order(rows: Sequence[RowOrGroup]) -> list[RowOrGroup]:
     """Sorted by task, then as METHODS is; methods that are not in it last."""
     order = list(METHODS)
     return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
@@ -124,7 +137,7 @@ def _row(group: Group) -> Row:
         steps=int(min(run.steps[-1] for run in group.runs)),
         source="evaluation" if first.evaluated else "training",
         scores={name: x for name, x in scores.items() if x is not None},
-        true_limit=group.true_limit,
+        excess=np.concatenate([run.excess for run in group.runs]),
     )
 
 

@@ -78,6 +78,30 @@ class RunLog:
         mean = np.where(known, values, 0.0).sum(1) / np.maximum(known.sum(1), 1)
         return np.where(known.any(1) & ~np.isin(self.seeds, self.broken), mean, np.nan)
 
+    @property
+    def excess(self) -> np.ndarray:
+        """[S] how far each seed's cost at the end (see `final`) is beyond the limit; of several costs the worst.
+
+        Where not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs.
+        """
+        several = sum(name.startswith("cost_limit/") for name in self.metrics)
+        if several:
+            limits = (np.nanmax(self.metrics[f"cost_limit/{k}"], axis=1) for k in range(several))
+            costs = (self._final(f"episode_cost/{k}") for k in range(several))
+            return np.max([cost - limit for cost, limit in zip(costs, limits, strict=True)], axis=0)
+        if self.settings.get("cost_seen", 1.0) < 1 and "true_episode_cost" in self.metrics:
+            return self._final("true_episode_cost") - self.true_limit
+        return self._final("episode_cost") - self.cost_limit
+
+    @property
+    def true_limit(self) -> float:
+        """The limit on true costs, of which the team feels a share."""
+        return self.cost_limit / self.settings.get("cost_seen", 1.0)
+
+    def _final(self, name: str) -> np.ndarray:
+        found = self.final(name)
+        return np.full(len(self.seeds), np.nan) if found is None else found
+
     def thinned(self, points: int) -> RunLog:
         """The same run with its metrics averaged into at most so many points, over what is known in each."""
         starts = [part[0] for part in np.array_split(np.arange(len(self.steps)), min(points, len(self.steps)))]
@@ -258,8 +282,8 @@ class Group:
 
     @property
     def true_limit(self) -> float:
-        """The limit on true costs, of which the team feels a share."""
-        return self.cost_limit / self.runs[0].settings.get("cost_seen", 1.0)
+        """The limit on what the costs are, felt or not."""
+        return self.runs[0].true_limit
 
     @property
     def label(self) -> str:

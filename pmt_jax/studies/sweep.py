@@ -11,7 +11,7 @@ import json
 import pathlib
 import shutil
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -194,11 +194,8 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
             continue
         first = number * config.seeds  # of its trials, whose rows know a rounded limit
         limit = dataclasses.replace(setup, config=config).cost_limit
-        mine = [
-            row | {"seed": row["seed"] - first + config.seed, "cost_limit": limit}
-            for row in rows
-            if 0 <= row["seed"] - first < config.seeds
-        ]
+        theirs = [row for row in rows if first <= row["seed"] < first + config.seeds]
+        mine = [row | {"cost_limit": limit} | _own_seed(row, config.seed - first) for row in theirs]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
@@ -210,3 +207,10 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         checkpoints.close()
         part.rename(out / name)
     shutil.rmtree(folder)
+
+
+def _own_seed(row: dict[str, Any], offset: int) -> dict[str, Any]:
+    """What a row says of its trial, said of the point's seed: in `broken`, too."""
+    trial, broken = row["seed"], row.get("broken")
+    seed = trial + offset
+    return {"seed": seed, "broken": broken and broken.replace(f"of seed {trial} ", f"of seed {seed} ")}

@@ -47,6 +47,12 @@ def render(table: Sequence[Row], form: str = "text", baseline: str | None = None
     return formats.write(*_cells(table, data, baseline, test), form, notes)
 
 
+def cells(table: Sequence[Row]) -> tuple[list[str], list[list[str]], list[str]]:
+    """The table without a baseline: its head, its lines, and what its numbers mean."""
+    data = summarise(table)
+    return *_cells(table, data, None, False), _notes(table, data, None, False)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # From rows to numbers
 
@@ -70,12 +76,12 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
     comparisons = compare.with_baseline(table, baseline) if baseline else {}
     result = []
     for row in table:
-        cost, against = row.scores[compared(table)[1]], comparisons.get((row.task, row.label))
+        cost, against = row.score(compared(table)[1]), comparisons.get((row.task, row.label))
         given = numbers.get(row.task, {})
         data: dict[str, Any] = {"task": row.task, "method": row.method, "settings": row.settings}
         data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, "cost_limit": row.cost_limit}
         data |= {c.name: _estimate(row.scores[c.name], c) for c in shown(table) if c.name in row.scores}
-        data |= {"within": float(row.within.mean()), "worst": _finite(cost.max())}
+        data |= {"within": float((row.beyond <= 0).mean()), "worst": _finite(cost.max())}
         data |= {"better": against and against.better, "p": against and against.p}
         data["paper"] = {"table": given.get("table"), **given.get(row.method, {})}
         result.append(data)

@@ -45,6 +45,7 @@ METRICS: dict[str, Metric] = {
     "episodes": Metric("", "episodes that ended", "sum"),
     "terminations": Metric("", "episodes that ended by the task's rule, not by the time limit", "sum"),
     "violation_rate": Metric("", "share of steps with a cost above 0 for some agent"),
+    "within_limit": Metric("", "share of evaluation episodes whose cost is within the limit, of several costs each"),
     "step_reward": Metric("reward", "reward of a control step"),
     "step_cost": Metric("cost", "cost of a control step, mean over agents"),
     "true_episode_cost": Metric("cost", "episode_cost before `cost_seen` and `cost_false`: what the costs were"),

@@ -20,7 +20,7 @@ from envs.base import Declarations, Scene
 from envs.voltage.layout import layout
 from pmt_jax import tasks
 from pmt_jax.errors import UsageError
-from pmt_jax.render import episode, film, gl, grid_map, page, report
+from pmt_jax.render import episode, film, gl, network_map, page, report
 
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1, "--no-cache")
 
@@ -53,6 +53,7 @@ def still(name: str, raw: dict[str, np.ndarray], cost: list[float]) -> episode.E
         reward_sum=zero,
         cost_sum=costs.cumsum(),
         info={},
+        action=np.zeros((len(costs), *env.spec.action_mask.shape)),
     )
 
 
@@ -186,7 +187,7 @@ def test_the_map_shows_voltages_against_the_band(grid: episode.Episode):
     assert data["kind"] == "map" and data["map"]["band"] == [0.95, 1.05]
     assert len(data["map"]["links"]) == 32 and len(data["map"]["agents"]) == 6
     np.testing.assert_array_equal(floats(data["map"]["values"], 2, 33), grid.raw["vm_pu"])
-    low, middle, high = grid_map.voltage_colours(np.array([0.94, 1.0, 1.06]), (0.95, 1.05))
+    low, middle, high = network_map.colours(np.array([0.94, 1.0, 1.06]), (0.95, 1.05))
     assert low[2] > 1.5 * low[0] and high[0] > 1.5 * high[2] and np.ptp(middle) < 0.05
 
 
@@ -255,7 +256,7 @@ def pages(lane: pathlib.Path, ant: episode.Episode, grid: episode.Episode, tmp_p
 
 def test_a_report_tells_all_there_is(pages: pathlib.Path, lane: pathlib.Path):
     text = (pages / "report.html").read_text()
-    assert text.count("<svg") == 8  # four figures of training, four of fear
+    assert text.count("<figure aria-label") == 8  # four metrics of training, four of fear
     assert "seed 3, sampled" in text and "seed 4, mean" in text and " ± " in text
     for words in ("lambda_lr", "matmul_precision", "1,000 environment steps a seed", "All metrics of the task"):
         assert words in text
@@ -368,4 +369,4 @@ def test_a_run_is_drawn_from_a_folder_that_cannot_be_written(lane: pathlib.Path,
     assert cli("render", copy, "-o", tmp_path / "x.html")[0] == 0
     assert sorted(p for p in copy.rglob("*")) == before
     (data,) = data_of((tmp_path / "x.html").read_text())
-    assert data["title"] == "lane, f4sg, seed 3" and list(data["info"]) == ["position"]
+    assert data["title"] == "lane, f4sg, seed 3" and data["panels"][2]["name"] == "position"

@@ -34,7 +34,7 @@ def test_shorter_runs_of_a_group_are_unknown_beyond_their_end(tmp_path: pathlib.
 
 
 def test_a_method_has_one_colour_everywhere():
-    assert list(plot.METHOD_COLOURS) == list(METHODS) and len(set(plot.METHOD_COLOURS.values())) == len(METHODS)
+    assert set(plot.METHOD_COLOURS) == set(METHODS) and len(set(plot.METHOD_COLOURS.values())) == len(METHODS)
     assert [look.colour for look in plot.looks(group("f4sg", "mappo"))] == [
         plot.METHOD_COLOURS["f4sg"],
         plot.METHOD_COLOURS["mappo"],
@@ -64,7 +64,11 @@ def test_ticks_of_a_cost_axis_can_be_read():
     assert plot.cost_ticks(1, 30) == [0, 0.5, 1, 2, 5, 10, 20]
     assert plot.cost_ticks(0.2, 900) == [0, 0.1, 0.2, 1, 10, 100, 1000]
     text = plot.inline(group("mappo"), "episode_cost", "cost")
-    assert "linear up to the limit" in text and all(f">{tick}<" in text for tick in ("0", "0.5", "1", "10", "100"))
+    assert (
+        "linear up to the limit" in text
+        and "logarithmic beyond" in text
+        and all(f">{tick}<" in text for tick in ("0", "0.5", "1", "10", "100"))
+    )
 
 
 def test_true_costs_are_drawn_where_not_all_are_felt():

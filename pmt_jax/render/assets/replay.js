@@ -1,5 +1,5 @@
 "use strict";
-// Plays the episodes of a page: every <figure class="replay"> holds its data as JSON (see pmt_jax/page.py).
+// Plays the episodes of a page: every <figure class="replay"> holds its data as JSON (see render/page.py).
 // Bodies are drawn by a rasteriser with a depth buffer, written out below: no WebGL, no library, no network.
 
 // ------------------------------------------------------------------------------------------------ the player
@@ -104,28 +104,26 @@ function fresh(canvas) {
   return [pen, width, height];
 }
 
+// Two lanes, each with its name above it: the reward of each step as a curve, its cost as bars.
 function drawStrip(canvas, data, moment) {
   const [pen, width, height] = fresh(canvas);
   const last = Math.max(1, data.reward.length - 1), x = (t) => t / last * width;
-  const middle = height * 0.6;
-  curve(pen, data.reward.slice(1), (t) => x(t + 1), 16, middle - 4, colour("accent"));
+  const lane = height / 2, name = 16;
   pen.fillStyle = colour("grid");
-  pen.fillRect(0, middle, width, height - middle);
+  pen.fillRect(0, lane + name, width, lane - name);
+  curve(pen, data.reward.slice(1), (t) => x(t + 1), name + 3, lane - 4, colour("accent"));
   pen.fillStyle = colour("danger");
   const largest = Math.max(...data.cost, 1e-9);
   data.cost.forEach((cost, t) => {
-    const tall = (height - middle) * (cost > 0 ? 0.3 + 0.7 * cost / largest : 0);
+    const tall = (lane - name) * (cost > 0 ? 0.3 + 0.7 * cost / largest : 0);
     pen.fillRect(x(t - 0.5), height - tall, Math.max(1.5, x(1) + 0.5), tall);
   });
+  pen.fillStyle = colour("quiet");
+  pen.fillText("reward of a step", 0, name - 4);
+  pen.fillText("cost of a step", 0, lane + name - 4);
   pen.fillStyle = colour("ink");
-  pen.strokeStyle = colour("paper");
-  pen.lineWidth = 3;
-  for (const [words, y] of [["reward of a step", 12], ["cost of a step", height - 6]]) {
-    pen.strokeText(words, 2, y);
-    pen.fillText(words, 2, y);
-  }
-  pen.fillStyle = colour("ink");
-  pen.fillRect(x(moment) - 1, 0, 2, height);
+  pen.fillRect(x(moment) - 1, name, 2, lane - name);
+  pen.fillRect(x(moment) - 1, lane + name, 2, lane - name);
 }
 
 // The curve of `values` between the heights `top` and `bottom`.
@@ -137,7 +135,6 @@ function curve(pen, values, x, top, bottom, stroke) {
   pen.beginPath();
   values.forEach((value, t) => pen.lineTo(x(t), y(value)));
   pen.stroke();
-  return y;
 }
 
 function unpackArray(text, type) {
@@ -147,26 +144,39 @@ function unpackArray(text, type) {
 
 // ------------------------------------------------------------------------------------------------ a task without a picture
 
+const LINES = ["#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#7f7f7f"]; // as in studies/plot.py
+
 function plainView(canvas, data) {
-  const names = Object.keys(data.info);
+  const panels = data.panels, last = Math.max(1, data.reward.length - 1);
   return (t) => {
-    const [pen, width, height] = fresh(canvas);
-    const lane = height / Math.max(1, names.length), last = Math.max(1, data.reward.length - 1);
-    const moment = Math.round(t), x = (k) => 12 + k / last * (width - 24);
-    names.forEach((name, i) => {
-      const values = data.info[name], top = i * lane;
-      const y = curve(pen, values, x, top + 28, top + lane - 12, colour("accent"));
-      pen.fillStyle = colour("quiet");
-      pen.fillText(`${name} ${values[moment].toPrecision(3)}`, 12, top + 16);
-      pen.fillStyle = data.cost[moment] > 0 ? colour("danger") : colour("ink");
-      pen.beginPath();
-      pen.arc(x(moment), y(values[moment]), 6, 0, 7);
-      pen.fill();
+    const columns = canvas.clientWidth > 560 ? 2 : 1, high = 84;
+    canvas.style.aspectRatio = "auto";
+    canvas.style.height = `${Math.ceil(panels.length / columns) * high}px`;
+    const [pen, width] = fresh(canvas), wide = width / columns, moment = Math.round(t);
+    panels.forEach(({ name, lines }, i) => {
+      const left = (i % columns) * wide, top = Math.floor(i / columns) * high;
+      const x = (k) => left + 10 + k / last * (wide - 24);
+      const all = lines.flat(), least = Math.min(...all), span = Math.max(...all) - least || 1;
+      const y = (value) => top + high - 8 - (value - least) / span * (high - 34);
+      pen.fillStyle = colour("ink");
+      const now = lines.map((line) => line[moment].toPrecision(3)).join("  ");
+      pen.fillText(`${name}  ${lines.length > 4 ? "" : now}`, left + 10, top + 16, wide - 20);
+      lines.forEach((line, k) => {
+        pen.strokeStyle = lines.length > 1 ? LINES[k % LINES.length] : colour("accent");
+        pen.lineWidth = 1.25;
+        pen.beginPath();
+        line.forEach((value, step) => pen.lineTo(x(step), y(value)));
+        pen.stroke();
+        pen.fillStyle = data.cost[moment] > 0 ? colour("danger") : colour("ink");
+        pen.beginPath();
+        pen.arc(x(moment), y(line[moment]), 3.5, 0, 7);
+        pen.fill();
+      });
     });
   };
 }
 
-// ------------------------------------------------------------------------------------------------ a map of voltages
+// ------------------------------------------------------------------------------------------------ a map of a network
 
 function mapView(canvas, data) {
   const map = data.map, n = map.x.length, values = unpackArray(map.values, "f4");
@@ -179,7 +189,7 @@ function mapView(canvas, data) {
     const size = Math.max(2.5, Math.min(8, width / 60, width / Math.sqrt(n) / 10));
     pen.lineCap = "round";
     for (const [a, b] of map.links) {
-      pen.strokeStyle = voltageColour((v[a] + v[b]) / 2);
+      pen.strokeStyle = bandColour((v[a] + v[b]) / 2);
       pen.lineWidth = size * 0.5;
       pen.beginPath();
       pen.moveTo(x(a), y(a));
@@ -189,7 +199,7 @@ function mapView(canvas, data) {
     }
     for (let i = 0; i < n; i++) {
       const out = v[i] < low || v[i] > high;
-      pen.fillStyle = voltageColour(v[i]);
+      pen.fillStyle = bandColour(v[i]);
       pen.strokeStyle = out ? colour("ink") : colour("paper");
       pen.lineWidth = out ? Math.max(1, size / 3) : 1;
       pen.beginPath();
@@ -202,7 +212,7 @@ function mapView(canvas, data) {
   };
 
   // Blue below the middle of the band, red above it; full strength begins where the band ends.
-  function voltageColour(value) {
+  function bandColour(value) {
     const off = (value - middle) / (high - middle), end = off < 0 ? [33, 102, 172] : [190, 40, 45];
     const strength = Math.abs(off) > 1 ? Math.min(1, 0.8 + 0.2 * (Math.abs(off) - 1)) : 0.55 * Math.abs(off);
     return `rgb(${[205, 205, 200].map((c, k) => Math.round(c + (end[k] - c) * strength))})`;
@@ -211,7 +221,7 @@ function mapView(canvas, data) {
   function legend(pen, width, height, v) {
     const wide = Math.min(260, width - 100), reach = 2 * (high - middle), top = height - 34;
     for (let k = 0; k < wide; k++) {
-      pen.fillStyle = voltageColour(middle - reach + 2 * reach * k / wide);
+      pen.fillStyle = bandColour(middle - reach + 2 * reach * k / wide);
       pen.fillRect(18 + k, top, 1.5, 10);
     }
     pen.fillStyle = colour("quiet");
@@ -220,7 +230,7 @@ function mapView(canvas, data) {
       pen.fillText(mark.toFixed(2), 18 + wide * (mark - middle + reach) / (2 * reach), top + 24);
     }
     pen.textAlign = "left";
-    pen.fillText(`now ${Math.min(...v).toFixed(3)} to ${Math.max(...v).toFixed(3)} p.u.`, 18, top - 8);
+    pen.fillText(`now ${Math.min(...v).toFixed(3)} to ${Math.max(...v).toFixed(3)} ${map.unit}`, 18, top - 8);
     pen.fillText("■ agent", 30 + wide, top + 10);
   }
 }
