@@ -56,7 +56,7 @@ def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 def replace_text(path: pathlib.Path, text: str) -> None:
     """Writes a file whole or, where that fails, leaves the old one."""
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text)
     partial.replace(path)
 

@@ -21,7 +21,8 @@ class Parser(argparse.ArgumentParser):
     """Raises one sentence, with the nearest known word, instead of printing its usage and exiting."""
 
     def error(self, message: str) -> NoReturn:
-        fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)  # from a type below
+        """Raises argparse's message, or the sentence of one of the types below."""
+        fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)
         raise UsageError(f"{fault[1]} {fault[2]}" if fault else f"{message} (see {self.prog} --help)")
 
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
@@ -88,6 +89,16 @@ def pixels(text: str) -> tuple[int, int]:
     return width, height
 
 
+def run_folder(text: str) -> pathlib.Path:
+    """The type of a run folder that holds metrics."""
+    if text.startswith("hub:"):
+        raise argparse.ArgumentTypeError(
+            f"must be run folders, which hold the metrics of training, not the pretrained policy '{text}'; pmt eval "
+            "and pmt render take one"
+        )
+    return pathlib.Path(text)
+
+
 def names(text: str) -> list[str]:
     """The type of words with commas between them."""
     return [name for name in text.split(",") if name]
@@ -143,6 +154,15 @@ def add_which(parser: Any) -> None:
 def add_deterministic(parser: Any) -> None:
     """--deterministic."""
     parser.add_argument("--deterministic", action="store_true", help="take the mean action instead of a sample")
+
+
+def add_trust(parser: Any) -> None:
+    """--trust."""
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="execute the Python file of the run's task, although it is not in the working folder",
+    )
 
 
 def add_seed(parser: Any) -> None:

@@ -7,7 +7,7 @@ import pathlib
 from typing import Any
 
 from ..output import say
-from .parser import RUN, add_deterministic, add_out, add_seed, command, pixels, span, whole
+from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, run_folder, span, whole
 from .process import at_once
 
 
@@ -27,6 +27,7 @@ def add(commands: Any) -> None:
         "--episode", type=whole(0), default=0, metavar="N", help="which of the fixed starts (default 0)"
     )
     add_deterministic(render)
+    add_trust(render)
     render.add_argument(
         "--steps", type=span, default=":", metavar="FROM:TO[:EVERY]", help="the control steps to show (default: all)"
     )
@@ -45,7 +46,7 @@ def add(commands: Any) -> None:
         description="Reward, cost, violations, multiplier and emotions over training; runs that differ in nothing but "
         "their seeds make one curve: the mean over seeds, in a band from the lowest to the highest.",
     )
-    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=run_folder, help="run folders")
     add_out(plot, "curves.png")
 
     report = command(
@@ -55,29 +56,32 @@ def add(commands: Any) -> None:
         "everything about runs on one page: pmt report runs/* -o report.html",
         description="Settings, versions, curves, an evaluation with intervals and a replay, in one file.",
     )
-    report.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    report.add_argument("run_folders", metavar="RUN", nargs="+", type=run_folder, help="run folders")
     add_out(report, "report.html")
     report.add_argument(
         "--episodes", type=whole(1), default=32, metavar="N", help="of the evaluation, per seed (default 32)"
     )
+    add_trust(report)
 
 
 def run_render(arguments: argparse.Namespace) -> int:
     """Writes an episode as a film or a page."""
     with at_once():
+        from ..policies.load import trusting
         from ..render import film
 
-    film.render(
-        arguments.run_folder,
-        arguments.out,
-        seed=arguments.seed,
-        number=arguments.episode,
-        deterministic=arguments.deterministic,
-        moments=arguments.steps,
-        fps=arguments.fps,
-        size=arguments.size,
-        say=say,
-    )
+    with trusting(arguments.trust):
+        film.render(
+            arguments.run_folder,
+            arguments.out,
+            seed=arguments.seed,
+            number=arguments.episode,
+            deterministic=arguments.deterministic,
+            moments=arguments.steps,
+            fps=arguments.fps,
+            size=arguments.size,
+            say=say,
+        )
     return 0
 
 
@@ -94,8 +98,12 @@ def run_plot(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     """Writes everything about runs on one page."""
     with at_once():
+        from ..policies.load import check_trusted, trusting
         from ..render import report
 
-    report.report(arguments.run_folders, arguments.out, arguments.episodes, say=say)
+    with trusting(arguments.trust):
+        for folder in arguments.run_folders:
+            check_trusted(folder)
+        report.report(arguments.run_folders, arguments.out, arguments.episodes, say=say)
     say(f"wrote {arguments.out}")
     return 0

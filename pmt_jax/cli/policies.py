@@ -10,7 +10,7 @@ from typing import Any
 from ..config.settings import convert
 from ..errors import UsageError
 from ..output import say
-from .parser import RUN, add_deterministic, add_seed, add_which, command, limits, whole
+from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, limits, whole
 from .process import at_once
 
 
@@ -29,6 +29,7 @@ def add(commands: Any) -> None:
     evaluation.add_argument("--episodes", type=whole(1), default=32, metavar="N", help="episodes per seed (default 32)")
     add_deterministic(evaluation)
     add_which(evaluation)
+    add_trust(evaluation)
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 
     export = command(
@@ -42,6 +43,7 @@ def add(commands: Any) -> None:
     export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
     add_seed(export)
     add_which(export)
+    add_trust(export)
 
     command(commands, "hub", run_hub, "list the pretrained policies, and how good they are")
 
@@ -54,6 +56,7 @@ def run_eval(arguments: argparse.Namespace) -> int:
             why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
             raise UsageError(f"--{flag} {why}")
     from ..policies import evaluate
+    from ..policies.load import trusting
 
     episodes = arguments.episodes
     if arguments.policy:
@@ -62,7 +65,8 @@ def run_eval(arguments: argparse.Namespace) -> int:
         how = f"policy {arguments.policy}"
     else:
         run, which = pathlib.Path(arguments.source), arguments.which or "last"
-        rows = evaluate.evaluate_run(run, episodes, arguments.deterministic, which, arguments.physics, say=say)
+        with trusting(arguments.trust):
+            rows = evaluate.evaluate_run(run, episodes, arguments.deterministic, which, arguments.physics, say=say)
         how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
         how += " of the best policy" if which == "best" else ""
     shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
@@ -76,7 +80,7 @@ def _say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
     whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
     say(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
-    metrics = {name: x for name, x in row.items() if isinstance(x, tuple)}
+    metrics = {name: x for name, x in row.items() if isinstance(x, tuple) and name != "cost_limit"}
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
         say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
@@ -86,8 +90,10 @@ def run_export(arguments: argparse.Namespace) -> int:
     """Writes a policy as files."""
     with at_once():
         from ..policies.export import export_policy
+        from ..policies.load import trusting
 
-    export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
+    with trusting(arguments.trust):
+        export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
     say(f"wrote policy.stablehlo, policy.npz and numpy_policy.py into {arguments.out}")
     return 0
 

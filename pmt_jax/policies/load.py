@@ -2,23 +2,57 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import pathlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 
+from ..config.settings import load_config
 from ..errors import UsageError
 from ..learning.setup import Setup
 from ..learning.types import ActingState
-from ..tasks import did_you_mean
+from ..tasks import did_you_mean, is_file
 from ..training.run_folder import MATMUL_PRECISION, load_saved
 from . import hub
 
 WHICH = ("last", "best")
 
 Policy = Callable[[jax.Array], jax.Array]
+
+_trusts = contextvars.ContextVar("trusts", default=False)
+
+
+@contextlib.contextmanager
+def trusting(trust: bool = True) -> Iterator[None]:
+    """Inside, runs of tasks that are Python files from elsewhere may be loaded, which executes the files."""
+    token = _trusts.set(trust or _trusts.get())
+    try:
+        yield
+    finally:
+        _trusts.reset(token)
+
+
+def check_trusted(folder: pathlib.Path) -> None:
+    """Refuses a run whose task is a Python file from elsewhere.
+
+    Raises:
+      UsageError: loading the run would execute a file that lies outside of the working folder, or in the run folder.
+    """
+    if _trusts.get() or hub.is_name(folder) or not (folder / "config.toml").is_file():
+        return
+    task = load_config(folder / "config.toml").task
+    if not is_file(task):
+        return
+    file = pathlib.Path(task.rpartition(".py")[0] + ".py").resolve()
+    if not file.is_relative_to(pathlib.Path.cwd().resolve()) or file.is_relative_to(folder.resolve()):
+        raise UsageError(
+            f"{folder} is a run of {file}, whose code would be executed, and which is not a file of your working "
+            "folder; add --trust (in Python: trust=True) if you trust it"
+        )
 
 
 def load_run(
@@ -42,17 +76,21 @@ def load_run(
         raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
     if hub.is_name(folder):
         return hub.load(str(folder), physics)
+    check_trusted(folder)
     setup, _, saved = load_saved(folder, physics, warn)
     return setup, saved["last"] if which == "last" else saved["best"].state
 
 
-def load_policy(folder: str | pathlib.Path, seed: int | None = None, which: str = "last") -> Policy:
+def load_policy(
+    folder: str | pathlib.Path, seed: int | None = None, which: str = "last", trust: bool = False
+) -> Policy:
     """A run's team policy as a pure function, to be jitted and vmapped at will.
 
     Args:
       folder: the run folder, which is only read, or the name of a pretrained policy: `hub:ant_2x4/r4sg`.
       seed: one of the run's seeds; its first if None.
       which: `last`, or `best`: the seed's own best (see docs/runs.md).
+      trust: execute the task's Python file even if it comes from elsewhere.
 
     Returns:
       policy: raw observations obs [N, O] -> mean action [N, A], 0 where an agent has no such entry. Observations are
@@ -61,7 +99,8 @@ def load_policy(folder: str | pathlib.Path, seed: int | None = None, which: str 
     Raises:
       UsageError: no run, no checkpoint, or no such seed.
     """
-    setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
+    with trusting(trust):
+        setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
     return policy_function(setup, state)
 
 

@@ -24,11 +24,11 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from . import claims
 from .checkpoint import Checkpoints
 from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
 
@@ -74,7 +74,7 @@ def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> No
     if resume:
         _same_settings(load_config(existing), setup.config, out)
         _same_machine(out, setup, say)
-    elif any(path.name != claims.NAME for path in out.iterdir()):
+    elif existing.exists() or any(path.name not in BEFORE_START and path.name[0] != "." for path in out.iterdir()):
         what = "another run" if existing.exists() else "other files"
         raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
 
@@ -118,9 +118,9 @@ def versions(setup: Setup) -> dict[str, Any]:
 
 
 def write_settings(out: pathlib.Path, setup: Setup) -> None:
-    """Writes config.toml and versions.json."""
-    replace_text(out / "config.toml", to_toml(setup.config))
+    """Writes versions.json and config.toml, which makes the folder that of a run."""
     replace_text(out / "versions.json", json.dumps(versions(setup), indent=2) + "\n")
+    replace_text(out / "config.toml", to_toml(setup.config))
 
 
 def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:

@@ -149,15 +149,17 @@ class Trainer:
         profile: pathlib.Path | None = None,
     ) -> None:
         """Opens what is written to until `stack` closes, and continues from the newest checkpoint if `resume`."""
+        if not resume:
+            processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
         self.checkpoints = stack.enter_context(contextlib.closing(Checkpoints(self.out)))
         if resume:
             self._restore()
+            if self.step < self.total:
+                processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
         processes.by_first(lambda: self._open_loggers(stack, loggers))
         self._profile = stack.enter_context(contextlib.closing(Profile(profile)))
 
     def _open_loggers(self, stack: contextlib.ExitStack, names: Sequence[str]) -> None:
-        if self.step < self.total:
-            run_folder.write_settings(self.out, self.setup)
         for logger in open_loggers(names, self.out, self.config, self.step):
             self._loggers.append(stack.enter_context(contextlib.closing(logger)))
         self._progress = stack.enter_context(contextlib.closing(Progress(self.total, self.step)))

@@ -15,10 +15,20 @@ import pytest
 import envs
 from envs.base import Env, State
 from envs.vector import VectorEnv
+from pmt_jax.config import toml
 
 BATCH = 4
 # Variants differ from hand_over_2x6 in numbers only, which hands/test_hand_over.py holds.
 ALL = [name for name in envs.names() if not name.startswith("hand_over_") or name == "hand_over_2x6"]
+SIBLINGS = {"ant_4x2", "voltage_141"}  # of tasks whose code is the same
+
+
+def each_task(*full: str):
+    """A test of every task; of siblings, and of those named, in the full suite alone."""
+    late = SIBLINGS | set(full)
+    return pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=pytest.mark.full if name in late else ()) for name in ALL]
+    )
 
 
 @functools.cache
@@ -46,7 +56,14 @@ def raw_data(tree):
     return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
+def test_its_configuration_describes_it(name: str):
+    spec = made(name).spec
+    for fact in (f" {spec.num_agents} agents", f" {spec.horizon} steps", f"limit {spec.cost_limit:g}"):
+        assert fact in toml.about(name)
+
+
+@each_task()
 def test_shapes_and_dtypes(name: str):
     spec, state = made(name).spec, start(name)
     assert spec.name == name
@@ -64,7 +81,7 @@ def test_shapes_and_dtypes(name: str):
     assert not state.reward.any() and not state.cost.any() and not state.terminated.any()
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_step_keeps_the_structure_that_reset_made(name: str):
     env = made(name)
     reset = jax.eval_shape(env.reset, jax.random.key(0))
@@ -77,7 +94,7 @@ def test_step_keeps_the_structure_that_reset_made(name: str):
     assert described(reset) == described(step)
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_cost_lies_in_the_unit_interval_and_everything_is_finite(name: str):
     state, step = start(name), programs(name)[1]
     for seed in range(5):
@@ -86,7 +103,7 @@ def test_cost_lies_in_the_unit_interval_and_everything_is_finite(name: str):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_pure(name: str):
     step, state = programs(name)[1], start(name)
     before = jax.tree.map(np.array, raw_data(state))
@@ -95,7 +112,7 @@ def test_pure(name: str):
     chex.assert_trees_all_equal(before, jax.tree.map(np.array, raw_data(state)))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_starts_differ_between_keys_and_repeat_with_a_key(name: str):
     if name in ("lane", "switch", "noisy"):
         pytest.skip("the toys start at their origin, by definition")
@@ -104,7 +121,7 @@ def test_starts_differ_between_keys_and_repeat_with_a_key(name: str):
     chex.assert_trees_all_equal(raw_data(state), raw_data(start(name)))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_no_recompilation_between_steps(name: str):
     step, state = programs(name)[1], start(name)
     state = step(state, actions(name, 0))
@@ -114,7 +131,7 @@ def test_no_recompilation_between_steps(name: str):
     assert step._cache_size() == compiled
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_restore_is_the_inverse_of_raw(name: str):
     env, step = made(name), programs(name)[1]
     state = step(start(name), actions(name, 0))
@@ -125,7 +142,7 @@ def test_restore_is_the_inverse_of_raw(name: str):
     chex.assert_trees_all_equal(raw_data(after), raw_data(expected))
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task("hand_over_2x6", "voltage_33")
 def test_same_numbers_jitted_or_not(name: str):
     env = made(name)
     state = jax.tree.map(lambda x: x[0], start(name))
@@ -136,7 +153,7 @@ def test_same_numbers_jitted_or_not(name: str):
     chex.assert_trees_all_close(raw_data(plain), raw_data(jitted), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task()
 def test_batches_nest(name: str):
     env = made(name)
     state = start(name)
@@ -147,7 +164,7 @@ def test_batches_nest(name: str):
     chex.assert_trees_all_close(raw_data(unnested), raw_data(flat), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ALL)
+@each_task("voltage_33")
 def test_auto_reset_starts_anew_every_time(name: str):
     vector = VectorEnv(made(name), 2, horizon=2)
     step = jax.jit(vector.step)

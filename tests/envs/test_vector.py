@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
+from envs.base import Env
 from envs.toys import Lane
 from envs.vector import VectorEnv
 
@@ -24,10 +25,15 @@ class Fragile(Lane):
         return dataclasses.replace(after, carry=carry, obs=after.obs + broken, reward=reward, terminated=terminated)
 
 
+def programs(env: Env, num_envs: int, horizon: int):
+    """The vector wrapper's reset and step, compiled."""
+    vector = VectorEnv(env, num_envs, horizon=horizon)
+    return jax.jit(vector.reset), jax.jit(vector.step)
+
+
 def test_a_time_limit_truncates_and_keeps_the_true_next_state():
-    vector = VectorEnv(envs.make("lane"), 3, horizon=4)
-    state = vector.reset(jax.random.key(0))
-    step = jax.jit(vector.step)
+    reset, step = programs(envs.make("lane"), 3, horizon=4)
+    state = reset(jax.random.key(0))
     for t in range(4):
         previous = state
         state, outcome = step(state, jnp.ones((3, 2, 2)))
@@ -41,27 +47,27 @@ def test_a_time_limit_truncates_and_keeps_the_true_next_state():
 
 
 def test_termination_is_not_truncation_even_on_the_last_step():
-    vector = VectorEnv(Fragile(), 1, horizon=5)
-    state = vector.reset(jax.random.key(0))
+    reset, step = programs(Fragile(), 1, horizon=5)
+    state = reset(jax.random.key(0))
     ends = []
     for _ in range(5):
-        state, outcome = vector.step(state, jnp.ones((1, 2, 2)))
+        state, outcome = step(state, jnp.ones((1, 2, 2)))
         ends.append((bool(outcome.terminated[0]), bool(outcome.truncated[0])))
     # 0.4, 0.72, 0.976, 1.18: beyond 1 on the fourth step, one before the limit.
     assert ends == [(False, False)] * 3 + [(True, False), (False, False)]
-    vector = VectorEnv(Fragile(), 1, horizon=4)
-    state = vector.reset(jax.random.key(0))
+    reset, step = programs(Fragile(), 1, horizon=4)
+    state = reset(jax.random.key(0))
     for _ in range(4):
-        state, outcome = vector.step(state, jnp.ones((1, 2, 2)))
+        state, outcome = step(state, jnp.ones((1, 2, 2)))
     assert outcome.terminated[0] and not outcome.truncated[0]
 
 
 def test_a_step_that_is_not_finite_is_quarantined_alone():
-    vector = VectorEnv(Fragile(), 2, horizon=9)
-    state = vector.reset(jax.random.key(0))
-    state, _ = vector.step(state, jnp.full((2, 2, 2), 0.5))
+    reset, step = programs(Fragile(), 2, horizon=9)
+    state = reset(jax.random.key(0))
+    state, _ = step(state, jnp.full((2, 2, 2), 0.5))
     before = state.env
-    state, outcome = jax.jit(vector.step)(state, jnp.stack([jnp.full((2, 2), -1.0), jnp.full((2, 2), 0.5)]))
+    state, outcome = step(state, jnp.stack([jnp.full((2, 2), -1.0), jnp.full((2, 2), 0.5)]))
     np.testing.assert_array_equal(outcome.non_finite, [True, False])
     np.testing.assert_array_equal(outcome.terminated, [True, False])
     np.testing.assert_array_equal(outcome.reward[0], 0)
@@ -74,10 +80,10 @@ def test_a_step_that_is_not_finite_is_quarantined_alone():
 
 
 def test_keys_of_resets_never_repeat():
-    vector = VectorEnv(envs.make("noisy"), 4, horizon=1)
-    state = vector.reset(jax.random.key(0))
+    reset, step = programs(envs.make("noisy"), 4, horizon=1)
+    state = reset(jax.random.key(0))
     seen = []
     for _ in range(5):
         seen.append(np.asarray(jax.random.key_data(state.env.carry.key)))
-        state, _ = vector.step(state, jnp.zeros((4, 2, 2)))
+        state, _ = step(state, jnp.zeros((4, 2, 2)))
     assert len(np.unique(np.concatenate(seen), axis=0)) == 20

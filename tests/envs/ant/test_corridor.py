@@ -52,7 +52,7 @@ def worst(actual, expected) -> float:
     return float(np.abs(np.asarray(actual, np.float64) - expected).max())
 
 
-@pytest.fixture(scope="session", params=["mujoco", "mjx"])
+@pytest.fixture(scope="session", params=["mujoco", pytest.param("mjx", marks=pytest.mark.full)])
 def replay(request):
     """Recording and our State after one control step from each of its rows."""
     rows = recording("ant_2x4")

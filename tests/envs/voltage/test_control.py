@@ -92,7 +92,7 @@ def test_raw_is_the_inverse_of_restore_in_mid_episode_and_with_noise() -> None:
     env = folder_env(noise=True, history=2)
     step = jax.jit(env.step)
     state = step(jax.jit(env.reset)(jax.random.key(3)), jnp.full((6, 1), 0.3))
-    again = env.restore(**env.raw(state))
+    again = jax.jit(lambda state: env.restore(**env.raw(state)))(state)
     for ours, theirs in zip(
         (state.obs, state.global_state, step(state, jnp.ones((6, 1))).obs),
         (again.obs, again.global_state, step(again, jnp.ones((6, 1))).obs),
@@ -213,7 +213,7 @@ def test_costs() -> None:
     np.testing.assert_allclose(cost["excess_mean", "network"], [[0.5 / 33]], rtol=1e-5)
     assert (zone[[7, 19, 20, 30]] == [1, 2, 2, 4]).all()
     spec = folder_env(cost_scope="regions").spec
-    state = folder_env(cost_scope="regions").reset(jax.random.key(0))
+    state = jax.eval_shape(folder_env(cost_scope="regions").reset, jax.random.key(0))
     assert spec.num_costs == 4 and state.cost.shape == (6, 4)
 
 
@@ -234,13 +234,12 @@ def test_profiles_in_the_package() -> None:
     for name, task in (("case33", "voltage_33"), ("case141", "voltage_141")):
         for data in ("simbench", "synthetic:3"):
             env = envs.make(task, data=data)
-            table, profiles = env.scenario.table, env.profiles
+            table, found = env.scenario.table, env.profiles
             np.testing.assert_allclose(env.s_max, table["s_max"], rtol=1e-6)
-            assert profiles.days >= 365 and profiles.pv.min() == 0
-            peak = profiles.p_load.sum(axis=1).max()
-            assert peak == pytest.approx(profiles.PEAK_LOAD[data.split(":")[0], name])
+            assert found.days >= 365 and found.pv.min() == 0
+            assert found.p_load.sum(axis=1).max() == pytest.approx(profiles.PEAK_LOAD[data.split(":")[0], name])
     again = profiles.synthetic_profiles("case141", table, seed=3)
-    np.testing.assert_array_equal(again.p_load, profiles.p_load)
+    np.testing.assert_array_equal(again.p_load, found.p_load)
 
 
 def test_rows_between_knots_are_on_straight_lines(tmp_path: Path) -> None:
@@ -310,6 +309,7 @@ def test_the_141_bus_net_needs_its_own_folder() -> None:
         envs.make("voltage_141", data=FOLDER)
 
 
+@pytest.mark.full
 def test_baselines_order_as_they_should() -> None:
     from envs.voltage.baselines import POLICIES
     from pmt_jax.learning.evaluation import play

@@ -1,0 +1,73 @@
+"""What the command line tells before anything runs: help, the list of tasks, and how results are printed."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+from pmt_jax.cli import commands, policies
+from pmt_jax.config.fields import GROUPS
+
+
+def test_help_and_lists_need_no_jax():
+    code = "import sys; from pmt_jax.cli import main\n"
+    code += "for argv in (['--help'], ['train', 'lane', '--help'], ['envs']): assert main(argv) == 0\n"
+    code += "assert not {'jax', 'mujoco', 'numpy'} & set(sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "train" in result.stdout and "eval" in result.stdout
+
+
+def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = cli("train", "--help")
+    assert code == 0
+    at = [out.index(f"\n{group}:\n") for group in GROUPS]
+    assert at == sorted(at) and out.index("--method") < out.index("--num-envs") < out.index("--lambda-lr")
+    words = " ".join(out.split())
+    assert "step of the multiplier per update" in words
+    assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
+
+
+def test_help_after_a_task_shows_its_own_defaults(cli):
+    def default(setting: str, *argv: str) -> str:
+        words = " ".join(cli("train", *argv)[1].split())
+        return words[words.index(f"--{setting} ") :].split("default ")[1].split("]")[0]
+
+    assert default("actor-lr", "--help") == "0.0003"
+    assert default("actor-lr", "ant_2x4", "--help") == default("actor-lr", "--help", "ant_2x4") == "0.0007"
+    assert default("env", "ant_2x4", "-h") == "observation=raw"
+    assert default("hidden", "ant_2x4", "--preset", "smoke", "--help") == "16"
+    assert cli("train", "ant2x4", "--help")[0] == 2
+
+
+def test_every_command_has_help(cli):
+    for name in commands.make_parser()[1]:
+        code, out, _ = cli(name, "--help")
+        assert code == 0 and out.startswith(f"usage: pmt {name}")
+
+
+def test_envs_lists_and_describes(cli):
+    _, out, _ = cli("envs")
+    assert "lane " in out and "2 agents of 2 actions, 25 steps, limit 1" in out
+    code, out, _ = cli("envs", "lane")
+    assert code == 0
+    for words in (
+        "2, with 2 action entries each",
+        "limit 1 an episode",
+        "25 control steps",
+        "plain JAX",
+        "num_agents=2",
+    ):
+        assert words in out
+    assert "unknown task 'lan'; did you mean 'lane'?" in cli("envs", "lan")[2]
+
+
+def test_one_episode_has_no_interval_and_long_names_keep_columns(capsys):
+    name = "info/a_name_that_is_longer_than_most_of_the_others"
+    policies._say_row({"seed": 0, "step": 1000, "cost_limit": (1.0, 2.5), "reward": (1.0, math.nan), name: (2.0, 0.5)})
+    head, reward, longest = capsys.readouterr().out.splitlines()
+    assert head == "seed 0 after 1,000 steps (cost limit 1, 2.5 an episode)"
+    assert reward.endswith("1.0000") and longest.endswith("2.0000 +- 0.5000")
+    assert reward.index("1.0000") == longest.index("2.0000")

@@ -1,0 +1,110 @@
+"""Equalities between methods: where what makes them differ is nothing, they are the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import acted, program, trained, weights
+
+from pmt_jax import METHODS
+from pmt_jax.learning import emotions, policy_update
+from pmt_jax.learning.types import Tag
+
+
+def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
+    lagrangian, _ = trained("mappo_l", lambda_init=0.0, lambda_lr=0.0)
+    chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
+
+
+def test_a_multiplier_that_acts_makes_a_difference():
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
+
+
+def test_happo_and_mappo_are_the_same_with_one_agent():
+    happo, mappo = (trained(method, env=(("num_agents", 1),))[0] for method in ("happo", "mappo"))
+    chex.assert_trees_all_equal(weights(happo), weights(mappo))
+
+
+@pytest.mark.parametrize(("method", "without"), [("r4sg", "mappo_l"), ("mixed", "f4sg")])
+def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without: str):
+    chex.assert_trees_all_equal(weights(trained(method, regret_max=0.0)[0]), weights(trained(without)[0]))
+
+
+def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(emotions, "appraise_fear", lambda setup, hyper, net, batch, key: (net, batch.cost, {}))
+    made = program.__wrapped__("f4sg")
+    state = made.init(made.setup.hyper, jax.random.key(0))
+    for _ in range(3):
+        state, _ = made.step(made.setup.hyper, state)
+    chex.assert_trees_all_equal(weights(state), weights(trained("mappo_l")[0]))
+
+
+@pytest.mark.full
+def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(METHODS, "macpo_regret", dataclasses.replace(METHODS["macpo"], ratio_weight="regret"))
+
+    def updated(method: str, **hyper: float):
+        made = program(method)
+        numbers = made.hyper(**hyper)
+        return weights(made.step(numbers, made.init(numbers, jax.random.key(0)))[0])["actor"]
+
+    without, plain = updated("macpo_regret", regret_max=0.0), updated("macpo")
+    chex.assert_trees_all_equal(without, updated("macpo_regret", kappa=0.0))
+    chex.assert_trees_all_close(without, plain, rtol=1e-2, atol=2e-4)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(updated("macpo_regret"), plain, rtol=1e-2, atol=2e-4)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("response", ["one_sided", "advantage"])
+def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
+    plain = weights(trained("mappo_l")[0])
+    without, _ = trained("r4sg", regret_response=response, regret_max=0.0)
+    chex.assert_trees_all_close(weights(without), plain, rtol=1e-4, atol=1e-5)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(weights(trained("r4sg", regret_response=response)[0]), plain, rtol=1e-4)
+
+
+def test_regret_stands_still_where_nothing_ever_costs():
+    setup, state, batch = acted()
+    harmless = dataclasses.replace(batch, cost=jnp.zeros_like(batch.cost))
+    appraise = jax.jit(lambda batch: emotions.appraise_regret(setup, setup.hyper, state.regret, batch, state.key))
+    net, log_weight, _ = appraise(harmless)
+    chex.assert_trees_all_equal(net, state.regret)
+    assert not log_weight.any()
+    net, log_weight, _ = appraise(batch)
+    assert log_weight.any()
+
+
+def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
+    setup, state, batch = acted()
+    hyper = setup.hyper
+    tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
+    noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
+    rows = policy_update.policy_rows(
+        setup, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
+    )
+    cost_excess = jnp.asarray([[0.5], [0.25]])
+    actor, multiplier, _ = policy_update._sequential(setup, hyper, state, rows, cost_excess, tagged)
+
+    factor = jnp.ones_like(rows.factor[0])
+    total = jnp.zeros_like(factor)
+    update = jax.jit(lambda *each: policy_update.update_policy(setup, hyper, *each))
+    for i in np.asarray(jax.random.permutation(tagged[Tag.ORDER], 2)):
+        mine = dataclasses.replace(policy_update._select_agent(rows, i), factor=factor)
+        before, key = policy_update._select_agent(state.actor, i), jax.random.fold_in(tagged[Tag.ACTOR], i)
+        net, _ = update(before, mine, cost_excess[i], key)
+        chex.assert_trees_all_close(net.params, policy_update._select_agent(actor.params, i), rtol=1e-5, atol=1e-6)
+        log_ratio = policy_update._policy_change(setup, net.params, mine)[0]
+        surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
+        expected = 0.78 + hyper.lambda_lr * (cost_excess[i, 0] + surrogate)
+        np.testing.assert_allclose(multiplier[i, 0], expected, rtol=1e-5)
+        factor, total = factor * jnp.exp(log_ratio), total + log_ratio
+    np.testing.assert_allclose(factor, jnp.exp(total), rtol=1e-5)
+    assert jnp.abs(factor - 1).max() > 1e-3

@@ -1,0 +1,47 @@
+"""Methods learn: small networks come near the optima of the toys (envs/toys.py has them).
+
+Beside every bound stand the mean and the standard deviation of 16 seeds' figures; a bound is at least three standard
+deviations away from the mean.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from pmt_jax import load_config, make_train
+
+
+def learned(task: str, method: str, steps: int = 30_000, **changes: str) -> tuple[float, float]:
+    """Mean episode cost and reward of the last 15 updates."""
+    config = load_config(task, method=method, num_envs=16, hidden=(16,), steps=steps, **changes)
+    _, metrics = jax.jit(make_train(config))(jax.random.key(1))
+    return tuple(float(np.asarray(metrics[name])[-15:].mean()) for name in ("episode_cost", "episode_reward"))
+
+
+@pytest.mark.parametrize(
+    ("task", "method"),
+    [
+        ("lane", "mappo"),  # cost 24.00 +- 0.01, reward 24.31 +- 0.13
+        pytest.param("lane", "happo", marks=pytest.mark.full),  # cost 24.00 +- 0.00, reward 24.37 +- 0.07
+        pytest.param("switch", "mappo", marks=pytest.mark.full),  # cost 24.99 +- 0.02, reward 24.28 +- 0.09
+        pytest.param("switch", "happo", marks=pytest.mark.full),  # cost 24.99 +- 0.02, reward 24.18 +- 0.09
+    ],
+)
+def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
+    cost, reward = learned(task, method)
+    assert cost >= 23 and reward >= 23.5
+
+
+@pytest.mark.parametrize(
+    ("method", "most_cost", "least_reward"),
+    [
+        ("mappo_l", 3, 16.4),  # cost 1.80 +- 0.33, reward 16.96 +- 0.14
+        ("macpo", 2, 16.4),  # cost 1.41 +- 0.06, reward 16.95 +- 0.11
+    ],
+)
+def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float, least_reward: float):
+    """Its limit is 1, where 18.85 can be earned."""
+    cost, reward = learned("lane", method)
+    assert cost <= most_cost and reward >= least_reward

@@ -1,0 +1,217 @@
+"""An update: one program for many seeds and settings, learning rates, bounds, what it keeps and what it reports."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import SMALL, acted, program, trained, weights
+
+import envs
+from envs.toys import Lane
+from pmt_jax import METHODS, load_config, make_setup, make_train
+from pmt_jax.learning import learner, rollout
+from pmt_jax.learning.types import LearnerState
+
+
+class TwoDangers(Lane):
+    """`lane` with a second cost: going left of -0.1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spec = dataclasses.replace(self.spec, num_costs=2)
+
+    def _state(self, carry, last_action, reward, cost):
+        state = super()._state(carry, last_action, reward, cost)
+        left = jnp.broadcast_to(carry.position < -0.1, (2, 1)).astype(float)
+        return dataclasses.replace(state, cost=jnp.concatenate([state.cost, left], axis=1))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One program
+
+
+def test_a_trial_does_not_feel_the_others_of_its_program():
+    """Three seeds with a multiplier's learning rate each."""
+    config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 400})
+    train, base = jax.jit(jax.vmap(make_train(config))), make_setup(config).hyper
+
+    def trained(seeds: list[int], rates: list[float]):
+        hyper = jax.tree.map(lambda x: jnp.broadcast_to(x, (3,)), base)
+        hyper = dataclasses.replace(hyper, lambda_lr=jnp.asarray(rates))
+        return train(jax.vmap(jax.random.key)(jnp.asarray(seeds)), hyper)
+
+    states, metrics = trained([0, 0, 2], [0.0, 0.1, 1.0])
+    np.testing.assert_allclose(states.multiplier[0], 0.78)
+    assert jnp.abs(states.multiplier[1] - states.multiplier[2]).max() > 1e-3
+    kernels = np.asarray(jax.tree.leaves(states.actor.params)[-1])
+    assert np.abs(kernels[0] - kernels[2]).max() > 1e-2
+    others = trained([5, 6, 2], [0.3, 3.0, 1.0])
+    third = [jax.tree.map(lambda x: x[2], (weights(state), figures)) for state, figures in ((states, metrics), others)]
+    chex.assert_trees_all_equal(*third)
+
+
+@pytest.mark.full
+def test_jitted_or_not():
+    config = load_config("lane", method="mappo_l", **{**SMALL, "num_envs": 2, "rollout_length": 3, "steps": 6})
+    train = make_train(config)
+    jitted, _ = jax.jit(train)(jax.random.key(0))
+    with jax.disable_jit():
+        plain, _ = train(jax.random.key(0))
+    chex.assert_trees_all_close(weights(jitted), weights(plain), rtol=1e-4, atol=1e-5)
+
+
+OWN = {"plain": lambda: None, "one agent": lambda: envs.make("lane", num_agents=1), "two costs": TwoDangers}
+QUICK = {("mappo", "plain"), ("macpo", "two costs")}
+
+
+@pytest.mark.parametrize(
+    ("method", "env"),
+    [
+        pytest.param(method, env, marks=() if (method, env) in QUICK else pytest.mark.full)
+        for method in METHODS
+        for env in OWN
+    ],
+)
+def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str, env: str):
+    setup = make_setup(load_config("lane", method=method, **SMALL), OWN[env]())
+    before = jax.eval_shape(functools.partial(learner.init, setup), setup.hyper, jax.random.key(0))
+    after, _ = jax.eval_shape(functools.partial(learner.train_step, setup), setup.hyper, before)
+    chex.assert_trees_all_equal_structs(before, after)
+    for x, y in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        assert not y.weak_type and not x.weak_type
+
+
+@pytest.mark.full
+def test_two_costs_have_a_multiplier_each():
+    setup = make_setup(load_config("lane", method="mappo_l", **SMALL), TwoDangers())
+    step = jax.jit(lambda key: learner.train_step(setup, setup.hyper, learner.init(setup, setup.hyper, key))[0])
+    multiplier = step(jax.random.key(0)).multiplier
+    assert multiplier.shape == (2, 2)
+    assert jnp.abs(multiplier[:, 0] - multiplier[:, 1]).max() > 1e-5
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How far it goes
+
+
+def test_learning_rates_decay_beyond_two_to_the_31_steps():
+    setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
+    hyper = dataclasses.replace(setup.hyper, lr_half_life=jnp.float32(1e9))
+    updates = jnp.asarray([122_070, 300_000, 2**31 - 1], jnp.int32)  # 1e9, 2.5e9 and 1.8e13 steps of a seed
+    rates = jax.vmap(lambda update: learner._annealed(setup, hyper, update).actor_lr)(updates)
+    expected = setup.config.actor_lr * 2.0 ** -(np.float64(updates) * setup.config.batch_size / 1e9)
+    np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
+
+
+def test_learning_rates_of_all_networks_halve_in_their_half_life():
+    made = program("mixed")
+    plain = made.setup.hyper
+    halved = {name: getattr(plain, name) / 2 for name in ("actor_lr", "critic_lr", "emotion_lr")}
+    falling = made.hyper(lr_half_life=made.setup.config.batch_size)
+    first, _ = made.step(falling, made.init(plain, jax.random.key(0)))
+    chex.assert_trees_all_equal(first, made.step(plain, made.init(plain, jax.random.key(0)))[0])
+    second, _ = made.step(falling, first)
+    chex.assert_trees_all_equal(second, made.step(made.hyper(**halved), first)[0])
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(second.actor, made.step(plain, first)[0].actor)
+
+
+@pytest.mark.parametrize("method", ["mappo", "r4sg"])
+def test_an_update_moves_no_policy_further_than_kl_max(method: str):
+    """A shared actor moves for all agents at once, so its bound holds for their mean."""
+    made = program(method)
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    free, metrics = made.step(made.setup.hyper, start)
+    far = np.asarray(metrics["actor/kl_per_agent"])
+    held, held_metrics = made.step(made.hyper(kl_max=far.mean() / 16), start)
+    near = np.asarray(held_metrics["actor/kl_per_agent"])
+    assert metrics["actor/share_of_step"] == 1.0
+    np.testing.assert_allclose(near.mean(), far.mean() / 16, rtol=0.2)
+    if method == "mappo":  # one step of all: the same way, a quarter of it (agents in turn answer to those before them)
+        share = held_metrics["actor/share_of_step"]
+        np.testing.assert_allclose(share, 0.25, rtol=1e-5)
+        way = jax.tree.map(lambda x, y: x + share * (y - x), start.actor.params, free.actor.params)
+        chex.assert_trees_all_close(held.actor.params, way, atol=1e-6)
+    chex.assert_trees_all_equal(made.step(made.hyper(kl_max=2 * far.max()), start)[0], free)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What it keeps
+
+
+def test_every_network_keeps_what_it_learned():
+    made = program("mixed")
+    start, (state, _) = made.init(made.setup.hyper, jax.random.key(0)), trained("mixed")
+
+    def nets(state: LearnerState):
+        return state.actor, state.critic.net, state.cost_critic.net, state.fear, state.regret
+
+    for now, then in zip(nets(state), nets(start), strict=True):
+        assert any((x != y).any() for x, y in zip(*map(jax.tree.leaves, (now.params, then.params)), strict=True))
+        assert (jax.tree.leaves(now.opt_state)[0] > 0).all()  # steps of Adam
+
+
+def test_observations_are_normalised_with_what_was_seen_before():
+    state, _ = trained("mixed")
+    assert state.obs_moments.weight == 3 * 8 * 25 * 2  # updates, environments, steps, agents
+    assert state.state_moments.weight == 3 * 8 * 25
+
+
+def test_diagnostics_of_fear_and_regret():
+    _, metrics = trained("mixed")
+    fear = {"fear/brier", "fear/ece", "fear/on_costly", "fear/on_safe"}
+    regret = {"regret/on_costly", "regret/on_safe", "regret/weight_mean", "regret/weight_std"}
+    assert fear | regret <= set(metrics)
+    assert metrics["actor/kl_per_agent"].shape == (2,)
+
+
+def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
+    _, _, batch = acted()
+    going = dataclasses.replace(batch, truncated=jnp.zeros_like(batch.truncated))
+    previous = jnp.full((2, 1), 7.0)
+    np.testing.assert_array_equal(rollout.episode_cost_estimate(going, previous, "episode", 25), previous)
+    rate = rollout.episode_cost_estimate(going, previous, "rate", 25)
+    np.testing.assert_allclose(rate, 25 * batch.cost.mean((0, 1)), rtol=1e-6)
+    ended = dataclasses.replace(going, truncated=going.truncated.at[3, 2].set(True))
+    estimate = rollout.episode_cost_estimate(ended, previous, "episode", 25)
+    np.testing.assert_array_equal(estimate, batch.episode_cost[3, 2])
+
+
+def test_figures_of_episodes_count_finished_ones_only():
+    """Episodes of 25 steps end in the third and the fifth rollout of 10 steps."""
+    vector = envs.vector.VectorEnv(envs.make("lane"), 8)
+
+    def collect(state, key):
+        def stand_still(obs):
+            return jnp.zeros((8, 2, 2)), jnp.full((2, 2), 1e-3)
+
+        state, batch, _ = rollout.collect(vector, state, stand_still, (lambda x: x, lambda x: x), key, 10)
+        return state, rollout.summary(batch)
+
+    keys = jax.random.split(jax.random.key(0), 5)
+    metrics = jax.jit(lambda: jax.lax.scan(collect, rollout.start(vector, jax.random.key(0)), keys)[1])()
+    np.testing.assert_array_equal(metrics["episodes"], [0, 0, 8, 0, 8])
+    np.testing.assert_array_equal(np.isfinite(metrics["episode_reward"]), [False, False, True, False, True])
+    np.testing.assert_array_equal(metrics["episode_length"][np.array([2, 4])], 25)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Presets
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("preset", ["paper_letter", "reference"])
+@pytest.mark.parametrize("method", ["mixed", "macpo"])
+def test_the_letter_of_the_paper_runs(method: str, preset: str):
+    state, metrics = jax.jit(make_train(load_config("lane", method=method, preset=preset, **SMALL)))(jax.random.key(0))
+    for x in jax.tree.leaves((weights(state), metrics["actor/loss"])):
+        assert np.isfinite(x).all()
+    if method == "macpo":
+        assert {"actor/case", "actor/line_search_steps"} <= set(metrics)

@@ -1,0 +1,36 @@
+"""Runs that cannot fit, and where compiled programs are kept."""
+
+from __future__ import annotations
+
+import pathlib
+from types import SimpleNamespace
+
+import pytest
+
+from pmt_jax.training import compile, memory
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (("--num-envs", "1e4"), "a batch of num_envs * rollout_length = 10000 * 25 steps needs at least"),
+        (("--hidden", "10000,10000"), "networks with hidden = [10000, 10000] needs at least"),
+        (("--seeds", "1e6"), "for 1000000 seed(s), but there are 0 GB here; ask for less"),
+    ],
+)
+def test_what_cannot_fit_is_refused(flags, says, cli, monkeypatch, tmp_path: pathlib.Path):
+    monkeypatch.setattr(memory, "_device_memory", lambda: 10e6)
+    code, _, err = cli("train", "lane", "--steps", "1e6", *flags, "--out", tmp_path / "x")
+    assert code == 2 and says in err and err.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("chosen", ["", "relative", None])
+def test_a_cache_home_that_does_not_count(chosen: str | None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(compile, "jax", SimpleNamespace(config=None))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", chosen)
+    assert compile.cache_folder() == pathlib.Path.home() / ".cache" / "pmt-jax"
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert compile.cache_folder() == pathlib.Path("/somewhere/pmt-jax")
