@@ -287,7 +287,8 @@ def load_config(
         values["env"] = [pair for layer in layers for pair in convert("env", layer.get("env", ()))]
     if "task" in values:
         values["task"] = absolute(str(values["task"]))
-    return Config(**{name: convert(name, value) for name, value in values.items()} | {"method": method})
+    converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
+    return Config(**converted | {"method": method})
 
 
 def _read(source: str | pathlib.Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import importlib.resources
 import json
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .encode import to_base64
 from .episode import Episode
 
 NUMBER = re.compile(r"[-+]?(\d|$)")  # the beginning of one, or - for none
@@ -93,11 +93,6 @@ def _panels(episode: Episode) -> list[dict[str, Any]]:
         lines = [_numbers(x) for x, used in zip(actions.T, mask, strict=True) if used]
         panels.append({"name": f"actions of agent {agent}", "lines": lines})
     return panels
-
-
-def to_base64(x: np.ndarray) -> str:
-    """Numbers for the page's script: bytes as they are, everything else as little-endian f32."""
-    return base64.b64encode(np.ascontiguousarray(x, "u1" if x.dtype == np.uint8 else "<f4").tobytes()).decode()
 
 
 def _numbers(x: np.ndarray) -> list[float]:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -115,8 +116,8 @@ def _newcombe(x: ArrayLike, y: ArrayLike, level: float) -> Interval:
         return (share - p) ** 2 - z**2 * variance
 
     inside = min(max(share, 1e-9), 1 - 1e-9)  # 0 and 1 are roots themselves where all pairs agree
-    low = scipy.optimize.brentq(beyond, 0, inside) if share > 0 else 0.0
-    high = scipy.optimize.brentq(beyond, inside, 1) if share < 1 else 1.0
+    low: Any = scipy.optimize.brentq(beyond, 0, inside) if share > 0 else 0.0  # its stub allows a report, too
+    high: Any = scipy.optimize.brentq(beyond, inside, 1) if share < 1 else 1.0
     return float(low), float(high)
 
 
