@@ -288,7 +288,8 @@ def load_config(
     if "task" in values:
         values["task"] = absolute(str(values["task"]))
     converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
-    return Config(**converted | {"method": method})
+    converted["method"] = method
+    return Config(**converted)
 
 
 def _read(source: str | pathlib.Path) -> dict[str, Any]:
