@@ -17,23 +17,15 @@ import functools
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
-from pmt_jax.cli.parser import refuse_unknown
+from pmt_jax.cli.parser import Parser, command, refuse_unknown, whole
 from pmt_jax.cli.process import answer
-from pmt_jax.errors import UsageError
 
 from . import compare, records, render, runner, runs
 from .cases import BENCHES
 
 say = functools.partial(print, flush=True)
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse that raises one sentence instead of printing its usage and exiting."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message} (see python -m bench --help)")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,45 +34,41 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    parser, commands = _parser()
-    refuse_unknown(argv, commands)
-    arguments = parser.parse_args(argv)
+    parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands: Any = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
+    _add_measuring(commands)
+    _add_showing(commands)
+    refuse_unknown(argv, commands.choices)
+    arguments = parser.parse_all(argv)
     return arguments.run(arguments)
 
 
-def _parser() -> tuple[_Parser, list[str]]:
-    parser = _Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands: Any = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
-    commands.add_parser("list", help="the benches, and how long they took").set_defaults(run=_list)
-    every = commands.add_parser("run", help="run all benches, or some, one after the other")
+def _add_measuring(commands: Any) -> None:
+    command(commands, "list", _list, "the benches, and how long they took")
+    every = command(commands, "run", _run_benches, "run all benches, or some, one after the other")
     every.add_argument("names", nargs="*", metavar="NAME", help="python -m bench list shows them")
     every.add_argument("--out", type=pathlib.Path, help="a folder (default: bench/results; for parts a new one)")
-    every.set_defaults(run=_run_benches)
-    one = commands.add_parser("measure", help="run one bench in this process, as `run` does in another")
+    one = command(commands, "measure", _measure, "run one bench in this process, as `run` does in another")
     one.add_argument("name", choices=BENCHES)
     one.add_argument("--out", type=pathlib.Path, required=True, help="a JSON file")
-    one.set_defaults(run=_measure)
-    for command in (every, one):
-        command.add_argument("--quick", action="store_true", help="a smoke: few cases, few repeats")
-        command.add_argument("--threads", type=int, default=0, help="use so many of the CPU's")
-        command.add_argument(
-            "--only", default="", metavar="WORDS", help="cases whose labels have all these, with commas"
-        )
-    compared = commands.add_parser("compare", help="ratios between results")
+    for parser in (every, one):
+        parser.add_argument("--quick", action="store_true", help="a smoke: few cases, few repeats")
+        parser.add_argument("--threads", type=whole(0), default=0, help="use so many of the CPU's")
+        parser.add_argument("--only", default="", metavar="WORDS", help="cases whose labels have all these")
+
+
+def _add_showing(commands: Any) -> None:
+    compared = command(commands, "compare", _compare, "ratios between results")
     compared.add_argument("old", help="a JSON file, a folder of them, or a git revision")
     compared.add_argument("new", help="the same")
-    compared.set_defaults(run=_compare)
-    rendered = commands.add_parser("render", help="make the tables of README.md and docs/ from bench/results")
+    rendered = command(commands, "render", _render, "make the tables of README.md and docs/ from bench/results")
     rendered.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a table is old")
-    rendered.set_defaults(run=_render)
-    stored = commands.add_parser("store", help="training runs as a result")
+    stored = command(commands, "store", _store, "training runs as a result")
+    stored.add_argument("folders", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
-    published = commands.add_parser("publish", help="make pretrained policies of runs, and tell their figures")
-    published.add_argument("--episodes", type=int, default=64, help="of the evaluations (default 64)")
-    for command, run, count in ((stored, _store, "+"), (published, _publish, "*")):
-        command.add_argument("folders", nargs=count, type=pathlib.Path, metavar="RUN", help="run folders")
-        command.set_defaults(run=run)
-    return parser, list(commands.choices)
+    published = command(commands, "publish", _publish, "make pretrained policies of runs, and tell their figures")
+    published.add_argument("folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders")
+    published.add_argument("--episodes", type=whole(1), default=64, help="of the evaluations (default 64)")
 
 
 def _list(arguments: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown
 from pmt_jax.studies import plot, table
@@ -108,8 +109,9 @@ def _row(run: Run) -> Row:
 
 
 def as_points(file: pathlib.Path) -> str:
-    """A line a run in the order of the file: what sets it apart, then means over seeds with 95 % intervals."""
+    """A line a run: what sets it apart, then means over seeds with 95 % intervals; in the order of METHODS."""
     found, columns = load(file), ("cost", WHILE_TRAINING, "reward")
+    found.sort(key=lambda run: (run["task"], list(METHODS).index(run["method"])))
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
     def cell(values: list[float]) -> str:

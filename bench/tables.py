@@ -103,7 +103,8 @@ def _compile_times_mappo_l(row: Row, rows: Rows) -> float | None:
 def _ours(row: Row, rows: Rows) -> list[float]:
     """Our rate in 32 bits, same network and batch, over that of this row, turn by turn."""
     same = {name: row.get(name) for name in ("kind", "task", "num_envs")}
-    return ratios(matching(rows, **same, what="ours f32")[0], row) if rate(row) else []
+    ours = [other for other in matching(rows, **same, what="ours f32") if rate(other)]
+    return ratios(ours[0], row) if ours and rate(row) else []
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
+import re
 import sys
 import tomllib
 from collections.abc import Callable
@@ -245,12 +246,30 @@ def stored() -> dict[str, list[runs.Run]]:
 def test_settings_of_stored_runs_have_their_present_names(name: str):
     for run in stored()[name]:
         assert set(tomllib.loads(run.get("config", ""))) <= set(FIELDS)
-        assert all(word.split("=")[0] in FIELDS for word in run.get("label", "").split(" ")[1:])
+        named = re.findall(r"([\w.]+) ?= ?", run.get("label", ""))
+        assert {word.split(".")[0] for word in named} <= set(FIELDS)
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "bench" / "sweeps").glob("*.toml")), ids=lambda file: file.stem)
+SWEEPS = sorted((ROOT / "bench" / "sweeps").glob("*.toml"))
+
+
+@pytest.mark.parametrize("file", SWEEPS, ids=lambda file: file.stem)
 def test_sweep_files_can_be_swept(file: pathlib.Path):
     assert points.make_points(points.from_file(file))
+
+
+@pytest.mark.parametrize("file", SWEEPS, ids=lambda file: file.stem)
+def test_stored_runs_have_the_settings_that_their_sweep_names(file: pathlib.Path):
+    sweep = tomllib.loads(file.read_text())
+    grids = [sweep | grid for grid in sweep.pop("sweep")]
+    fixed = [{k: v for k, v in grid.items() if k not in ("extends", "set", "random")} for grid in grids]
+    for run in [run for run in stored().get(file.stem, []) if "config" in run]:  # the oldest have none
+        settings = tomllib.loads(run["config"])
+        assert any(
+            all(settings[name] == value for name, value in given.items())
+            and all(settings[name] in values for name, values in grid["set"].items())
+            for given, grid in zip(fixed, grids, strict=True)
+        )
 
 
 def fake_run(folder: pathlib.Path, **settings: Any) -> pathlib.Path:
@@ -288,7 +307,7 @@ def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     lines = runs.as_points(tmp_path / "points.json").splitlines()
     assert lines[0] == "| task | method | cost | cost while training | reward |"
     assert [line.split(" | ")[1] for line in lines[2:]] == ["happo clip=0.1", "happo clip=0.2"]
-    assert " | 100.67 [" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
+    assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
 
 
 def test_paths_of_ants_are_stored_and_drawn(
