@@ -15,6 +15,12 @@ from .process import at_once, refuse_many
 
 def add(commands: Any) -> None:
     """Adds the commands."""
+    _add_sweep(commands)
+    _add_table(commands)
+    _add_reproduce(commands)
+
+
+def _add_sweep(commands: Any) -> None:
     sweep = command(
         commands,
         "sweep",
@@ -40,6 +46,8 @@ def add(commands: Any) -> None:
     add_jobs(sweep)
     add_settings(sweep)
 
+
+def _add_table(commands: Any) -> None:
     table = command(
         commands,
         "table",
@@ -53,6 +61,8 @@ def add(commands: Any) -> None:
     add_format(table)
     table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
 
+
+def _add_reproduce(commands: Any) -> None:
     reproduce = command(
         commands,
         "reproduce",
