@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.metadata
 import os
 import pathlib
 import platform
+import shutil
+import subprocess
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's complaints about programs it takes from the cache
 
@@ -38,3 +41,58 @@ def cli(capsys: pytest.CaptureFixture[str]):
         return code, captured.out, captured.err
 
     return run
+
+
+@pytest.fixture(scope="session", autouse=True)
+def programs_are_shared():
+    """Training compiles a program once a process (`runs.compile_once`)."""
+    from pmt_jax.training import trainer
+    from runs import compile_once
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, "compile_run", compile_once)
+        yield
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """The run of `runs.ARGUMENTS` that nothing befell, with the checkpoints of its last two chunks.
+
+    The first process that asks for it trains it, all others wait. Nobody changes it.
+    """
+    from pmt_jax.cli import main
+    from pmt_jax.training import trainer
+    from runs import ARGUMENTS, STEPS
+
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    out, making = base / "whole", base / "whole-unfinished"
+    with (base / "whole.lock").open("w") as lock, pytest.MonkeyPatch.context() as patch:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not out.exists():
+            patch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+            assert main([str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", making)]) == 0
+            making.rename(out)
+    return out
+
+
+@pytest.fixture
+def copy(whole: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+    """A copy of that run, to be damaged."""
+    return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
+
+
+@pytest.fixture
+def small_disk(tmp_path: pathlib.Path):
+    """A file system of 160 kB, room for two checkpoints, and a function that mounts it anew with other options."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def mount(options: str) -> bool:
+        command = ["mount", "-t", "tmpfs", "-o", options, "none", str(place)]
+        return subprocess.run(command, capture_output=True).returncode == 0
+
+    if not shutil.which("mount") or not mount("size=160k"):
+        pytest.skip("may not mount a file system here")
+    yield place, lambda options: mount(f"remount,{options}")
+    subprocess.run(["umount", "-l", str(place)], check=True)

@@ -1,20 +1,25 @@
-"""A run of two seeds, 16 updates, that trains in a second; what its folder holds."""
+"""The run that tests share: two seeds, 16 updates; what its folder holds, and its programs, compiled once."""
 
 from __future__ import annotations
 
 import json
 import os
 import pathlib
+from typing import Any
 
 import jax
 import numpy as np
 
+from pmt_jax.learning.setup import Setup
+from pmt_jax.learning.types import LearnerState
+from pmt_jax.output import Say
 from pmt_jax.policies import load
 from pmt_jax.training import checkpoint
+from pmt_jax.training.compile import Programs, compile_run
 
 STEPS = 1600
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
-ARGUMENTS = ("lane", *TINY, "--seeds", 2, "--eval-interval", 4, "--eval-episodes", 4, "--no-cache")
+ARGUMENTS = ("lane", *TINY, "--method", "f4sg", "--seeds", 2, "--eval-interval", 4, "--eval-episodes", 4, "--no-cache")
 
 
 def rows(out: pathlib.Path) -> list[dict]:
@@ -41,3 +46,21 @@ def environment() -> dict[str, str]:
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
     }
+
+
+_compiled: dict[Any, tuple[LearnerState, Programs]] = {}
+
+
+def compile_once(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
+    """`compile_run`, but runs of one process that differ in their steps alone share their programs."""
+    config = setup.config
+    if setup.mesh or pathlib.Path(config.task).suffix:  # a file may have changed
+        return compile_run(setup, say)
+    trials = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(vars(setup.trials) if setup.trials else None))
+    key = (repr(config.replace(steps=10**9)), repr(setup.method), trials)
+    if key not in _compiled:
+        _compiled[key] = compile_run(setup, say)
+    else:
+        say("compiled in 0.0 s (by a test before this one)")
+    state, programs = _compiled[key]
+    return jax.tree.map(lambda x: x.copy(), state), programs

@@ -1,0 +1,67 @@
+"""Policies loaded and exported are those that were evaluated."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pmt_jax import load_config, load_policy, make_setup
+from pmt_jax.learning.maths import running_moments
+from pmt_jax.policies import load, numpy_policy
+from pmt_jax.policies.export import weights
+
+
+def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
+    run, state = load.load_run(whole)
+    obs = jax.random.normal(jax.random.key(0), (5, 2, 8)) * 3
+    moments, params = jax.tree.map(lambda x: x[1], (state.obs_moments, state.actor.params))
+    expected = run.nets.policies(params, running_moments.normalise_obs(moments, obs))[0]
+    policy = load_policy(whole, seed=1)
+    np.testing.assert_allclose(jax.jit(jax.vmap(policy))(obs), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(policy(obs[2]), expected[2], rtol=1e-5, atol=1e-6)
+    assert np.abs(np.asarray(load_policy(whole, seed=0)(obs[2]) - expected[2])).max() > 1e-3
+    with pytest.raises(ValueError, match="has no seed 7; it has 0, 1"):
+        load_policy(whole, seed=7)
+
+
+def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    code, out, _ = cli("export", whole, "-o", tmp_path, "--seed", 1, "--which", "best")
+    assert code == 0 and str(tmp_path) in out
+    obs = np.asarray(jax.random.normal(jax.random.key(0), (5, 2, 8)))
+    expected = jax.vmap(load_policy(whole, seed=1, which="best"))(obs)
+    exported = jax.export.deserialize((tmp_path / "policy.stablehlo").read_bytes())
+    np.testing.assert_allclose(exported.call(obs), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(exported.call(obs[:2]), expected[:2], rtol=1e-5, atol=1e-6)
+    code = "import sys, numpy, numpy_policy; policy = numpy_policy.load('policy.npz'); assert 'jax' not in sys.modules;"
+    code += "print(policy(numpy.ones((2, 8))).tolist())"
+    alone = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    expected = load_policy(whole, seed=1, which="best")(jnp.ones((2, 8)))
+    np.testing.assert_allclose(json.loads(alone.stdout), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"method": "mappo", "layer_norm": True, "activation": "elu"},
+        {"obs_norm": "layernorm", "layer_norm": True, "activation": "relu"},
+        {"obs_norm": "layernorm", "layer_norm": False},
+        {"obs_norm": "none", "hidden": [8, 4]},
+    ],
+)
+def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pathlib.Path):
+    run = make_setup(load_config("lane", **{"hidden": [8], **changes}))
+    noise = jax.random.normal(jax.random.key(1), (50, 8))
+    moments = running_moments.accumulate(running_moments.init((8,)), 3 * noise + 1)
+    params = jax.tree.map(lambda x: x + noise[0, 0], jax.jit(run.nets.init_actor)(jax.random.key(0)))
+    np.savez(tmp_path / "policy.npz", **weights(run, params, moments))
+    obs = 5 * jax.random.normal(jax.random.key(2), (4, 3, 2, 8))
+    expected = run.nets.policies(params, run.scale(moments, obs))[0]
+    np.testing.assert_allclose(numpy_policy.load(tmp_path / "policy.npz")(obs), expected, rtol=2e-5, atol=2e-5)

@@ -1,0 +1,67 @@
+"""Evaluations during training, and the best policy that they choose."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pmt_jax.learning.evaluation import interval, is_better
+from runs import rows
+
+
+def test_evaluations_during_training(whole: pathlib.Path, cli):
+    table = rows(whole)
+    names = [name for name in table[0] if name.startswith("eval/")]
+    assert {"eval/episode_reward", "eval/episode_cost", "eval/violation_rate", "eval/info/position"} <= set(names)
+    assert {f"{name}/ci95" for name in names if not name.endswith("/ci95")} <= set(names)
+    for row in table:
+        due = row["step"] % 400 == 0
+        assert all((row[name] is not None) == due for name in names)
+    text = cli("eval", whole, "--episodes", 4, "--deterministic")[1]
+    for row in table[-2:]:
+        assert f"{row['eval/episode_reward']:12.4f} +- {row['eval/episode_reward/ci95']:.4f}" in text
+
+
+def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
+    expected = []
+    for seed in (0, 1):
+        known = [row for row in rows(whole) if row["seed"] == seed and row["eval/episode_reward"] is not None]
+        safe = [row for row in known if row["eval/episode_cost"] <= row["cost_limit"]]
+        by_cost = min(known, key=lambda row: row["eval/episode_cost"])
+        expected.append(max(safe, key=lambda row: row["eval/episode_reward"]) if safe else by_cost)
+    text = cli("eval", whole, "--episodes", 4, "--deterministic", "--which", "best")[1]
+    assert "mean actions of the best policy" in text
+    for row in expected:
+        assert f"seed {row['seed']} after {row['step']:,} steps" in text
+        assert f"{row['eval/episode_reward']:12.4f} +-" in text
+    assert "unknown checkpoint 'bset'; did you mean 'best'?" in cli("eval", whole, "--which", "bset")[2]
+
+
+figures = st.floats(-100, 100, width=32) | st.just(float("nan"))
+
+
+@given(reward=figures, cost=figures, best_reward=figures, best_cost=figures)
+def test_better_is_an_order(reward: float, cost: float, best_reward: float, best_cost: float):
+    def better(a: tuple[float, float], b: tuple[float, float]) -> bool:
+        return bool(is_better(*np.float32([*a, *b]), limit=1.0))
+
+    new, old = (reward, cost), (best_reward, best_cost)
+    assert not better(new, new)
+    assert not (better(new, old) and better(old, new))
+    if not np.isnan([*new, *old]).any():
+        key = [(c <= 1, r if c <= 1 else -c) for r, c in (new, old)]
+        assert better(new, old) == (key[0] > key[1])
+    if np.isnan(cost):
+        assert not better(new, old)
+
+
+def test_the_interval_is_students():
+    x = np.random.default_rng(0).normal(3, 2, 7)
+    mean, half = interval(x)
+    low, high = scipy.stats.t.interval(0.95, 6, x.mean(), scipy.stats.sem(x))
+    np.testing.assert_allclose([mean - half, mean + half], [low, high])
+    assert np.isnan(interval(x[:1])[1])
