@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import doctest
+import functools
 import importlib
 import json
 import pathlib
@@ -50,6 +51,7 @@ def public(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.Fu
                 yield from public(node.body, f"{prefix}{node.name}.")
 
 
+@functools.cache
 def contracts() -> set[str]:
     """The methods that a Protocol of ours documents for all who keep it."""
     trees = [ast.parse(path.read_text()) for path in MODULES]
@@ -72,7 +74,7 @@ def test_everything_public_is_documented(path: pathlib.Path):
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=name(path), marks=[pytest.mark.slow] if name(path) in SLOW else [])
+        pytest.param(path, id=name(path), marks=[pytest.mark.full] if name(path) in SLOW else [])
         for path in MODULES
         if ">>> " in path.read_text()
     ],
@@ -96,6 +98,7 @@ def test_python_in_markdown(path: pathlib.Path):
             exec(program, namespace)
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")
 def test_the_tutorial(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     matplotlib = pytest.importorskip("matplotlib")

@@ -19,14 +19,13 @@ from pmt_jax.training import checkpoint
 
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
 ARGUMENTS = ("train", "lane", "--num-envs", 4, *TINY, "--eval-interval", 2, "--eval-episodes", 2, "--seeds", 1)
-QUICK = "--xla_backend_optimization_level=0"  # compiles in half the time; what it computes is compared with its like
-FOUR = f"{QUICK} --xla_force_host_platform_device_count=4"
+FOUR = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
 
 
 def environment(**more: str) -> dict[str, str]:
     """Of a process of its own, which shares the tests' compile cache."""
     cache = {"JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
-    return os.environ | cache | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": QUICK} | more
+    return os.environ | cache | {"PYTHONPATH": str(ROOT)} | more
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -78,6 +77,7 @@ def compare(task: str, **sizes: object) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.full
 def test_seeds_and_environments_split_change_nothing_but_rounding():
     """The corridor ant under the method with the most networks; the C engine steps each device's own environments."""
     found = compare("ant_2x4", method="mixed", seeds=2, num_envs=8)
@@ -86,19 +86,21 @@ def test_seeds_and_environments_split_change_nothing_but_rounding():
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
 
 
+@pytest.mark.full
 def test_warp_steps_each_devices_own_environments():
     pytest.importorskip("warp")
     found = compare("ant_2x4", method="mappo_l", seeds=2, num_envs=8, physics="warp")
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_environments_split_under_a_trust_region():
     found = compare("lane", method="macpo", seeds=1, num_envs=4)
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
     assert any("reduce_sum" in line for line in found["collectives"])
 
 
+@pytest.mark.full
 def test_seeds_do_not_wait_for_each_other():
     found = compare("lane", method="happo", seeds=4, num_envs=3)
     figures = [line for line in found["collectives"] if "while" not in line]  # gathered after the scan of updates
@@ -148,6 +150,7 @@ def assert_close(out: pathlib.Path, other: pathlib.Path) -> None:
             np.testing.assert_allclose(x, second[path], rtol=1e-3, atol=1e-5, err_msg=path)
 
 
+@pytest.mark.full
 def test_two_processes_train_what_one_trains(tmp_path: pathlib.Path, cli):
     alone, out = tmp_path / "alone", tmp_path / "two"
     assert cli(*ARGUMENTS, "--steps", 160, "--out", alone)[0] == 0

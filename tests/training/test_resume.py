@@ -49,6 +49,8 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
     assert process.returncode == -signal.SIGKILL
     assert {p.name for p in (out / "checkpoints").iterdir()} == {"400", "600", "800.orbax-checkpoint-tmp"}
     assert rows(out)[-1]["step"] == 800
+    with (out / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 12')  # a line that was being written
 
     code, text, _ = cli(*arguments, "--resume")
     assert code == 0 and "resuming after 600 steps" in text
