@@ -90,8 +90,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
 def test_output_that_nobody_reads_any_more(whole: pathlib.Path):
     command = f"{sys.executable} -m pmt_jax eval {whole} --episodes 2 | true"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    for environment in (buffered, buffered | {"PYTHONUNBUFFERED": "1"}):
-        result = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True)
+    for variables in (buffered, buffered | {"PYTHONUNBUFFERED": "1"}):
+        result = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True)
         assert "Traceback" not in result.stderr and "BrokenPipe" not in result.stderr
 
 
