@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import acted, program, trained, weights
 
 from pmt_jax import METHODS
 from pmt_jax.learning import emotions, policy_update
 from pmt_jax.learning.types import Tag
+from small import acted, program, trained, weights
 
 
 def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():

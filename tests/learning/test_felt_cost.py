@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import program
 
 from envs.vector import felt_cost
 from pmt_jax import load_config, make_setup
 from pmt_jax.errors import UsageError
+from small import program
 
 B, N, K = 40_000, 2, 1
 

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import SMALL, acted, program, trained, weights
 
 import envs
 from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.learning import learner, rollout
 from pmt_jax.learning.types import LearnerState
+from small import SMALL, acted, program, trained, weights
 
 
 class TwoDangers(Lane):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+
 from runs import ARGUMENTS, STEPS, assert_same_run, environment
 
 BUSY = """
