@@ -8,8 +8,8 @@ import shutil
 import subprocess
 
 import pytest
-import soak
 
+import soak
 from runs import STEPS, assert_same_run
 
 LONG = 6000  # 30 rows, each with a checkpoint: two seconds
