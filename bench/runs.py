@@ -66,7 +66,7 @@ def _compact(log: RunLog) -> Run:
     return {
         "steps": found.steps.tolist(),
         "seeds": list(found.seeds),
-        **{name: [[_rounded(x) for x in seed] for seed in found.metrics[name]] for name in names},
+        **{name: [[_rounded(x, 5) for x in seed] for seed in found.metrics[name]] for name in names},
         "diagnostics": {name: [_rounded(x) for x in mean] for name, mean in diagnostics.items()},
         "table": {column: [_rounded(x) for x in seeds] for column, seeds in scores.items()},
         "source": row.source,
@@ -80,8 +80,8 @@ def _compact(log: RunLog) -> Run:
     }
 
 
-def _rounded(x: float) -> float | None:
-    return float(f"{x:.5g}") if np.isfinite(x) else None
+def _rounded(x: float, digits: int = 6) -> float | None:
+    return float(f"{x:.{digits}g}") if np.isfinite(x) else None
 
 
 def curves(run: Run) -> RunLog:

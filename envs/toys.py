@@ -85,6 +85,7 @@ class Lane:
         return self._state(carry, jnp.asarray(last_action, float), reward=zero, cost=zero)
 
     def raw(self, state: State) -> dict[str, Any]:
+        """What `restore` takes."""
         last_action = state.global_state[1:-1].reshape(self.spec.action_mask.shape)
         return {**vars(state.carry), "last_action": last_action}
 

@@ -303,6 +303,7 @@ class VoltageControl:
         return self._observe(self._first(start_row, q, row, key)[0])
 
     def raw(self, state: State) -> dict[str, Any]:
+        """What `restore` takes."""
         return dict(vars(state.carry))
 
     # Data

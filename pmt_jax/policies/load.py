@@ -121,6 +121,7 @@ def load_seed(
 
 
 def policy_function(setup: Setup, state: ActingState) -> Policy:
+    """The mean action of one seed's policy: obs [N, O] -> action [N, A], padded entries 0."""
     mask = jnp.asarray(setup.vector.spec.action_mask)
 
     def policy(obs: jax.Array) -> jax.Array:

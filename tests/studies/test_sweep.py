@@ -112,17 +112,21 @@ def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == NAMES
 
 
+class Killed(BaseException):
+    """Stands for kill -9: nothing of the program answers it."""
+
+
 def test_killed_while_the_points_are_written(swept: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     rename = pathlib.Path.rename
 
     def die(path: pathlib.Path, target: pathlib.Path) -> pathlib.Path:
         if target.name == NAMES[1]:
-            raise SystemExit("killed")
+            raise Killed
         return rename(path, target)
 
     with monkeypatch.context() as patch:
         patch.setattr(pathlib.Path, "rename", die)
-        with pytest.raises(SystemExit):
+        with pytest.raises(Killed):
             cli(*COMMAND, tmp_path)
     assert (tmp_path / NAMES[0]).is_dir() and not (tmp_path / NAMES[1]).exists()
     code, out, _ = cli(*COMMAND, tmp_path)
