@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from runs import ARGUMENTS, STEPS, rows, saved
 
 from pmt_jax import load_config, make_setup
 from pmt_jax.training import health, trainer
 from pmt_jax.training.metrics import LOSSES
+from runs import ARGUMENTS, STEPS, rows, saved
 
 
 def breaking(monkeypatch: pytest.MonkeyPatch, updates: dict[int, int]) -> None:
@@ -108,10 +108,11 @@ import dataclasses
 import jax.numpy as jnp
 from envs.toys import Lane
 
-class Broken(Lane):  # finite where nobody acts, as in the check before training
+class Broken(Lane):  # finite for actions of 0 and 1, with which a task is checked before training
     def step(self, state, action):
         after = super().step(state, action)
-        return dataclasses.replace(after, reward=jnp.where(action.any(), jnp.nan, after.reward))
+        reward = jnp.where((action * (1 - action)).any(), jnp.nan, after.reward)
+        return dataclasses.replace(after, reward=reward)
 """
 
 
