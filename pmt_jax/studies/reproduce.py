@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 from collections.abc import Mapping, Sequence
 
@@ -9,6 +10,7 @@ from ..config.methods import METHODS
 from ..errors import UsageError
 from ..learning.setup import make_setup
 from ..tasks import did_you_mean, names
+from ..training.claims import claim
 from . import table
 from .points import Part, Points, make_points
 from .rows import rows
@@ -36,10 +38,11 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     plans = {task: plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
     for points in plans.values():
         make_setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
-    code = train_programs(
-        [program for task, points in plans.items() for program in missing_programs(points, out / task, launch.say)],
-        launch,
-    )
+    with contextlib.ExitStack() as stack:
+        for task in plans:
+            stack.enter_context(claim(out / task))
+        wanted = [missing_programs(points, out / task, launch.say) for task, points in plans.items()]
+        code = train_programs([program for programs in wanted for program in programs], launch)
     if code:
         return code
     logs = read_all([out / task / point for task, points in plans.items() for point in points])

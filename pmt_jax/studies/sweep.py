@@ -22,6 +22,7 @@ from ..files import read_rows, writing
 from ..learning.setup import Trials, make_setup
 from ..training import trainer
 from ..training.checkpoint import Checkpoints
+from ..training.claims import claim
 from ..training.run_folder import Say, load_saved
 from . import table, workers
 from .points import Part, Points, drawn
@@ -53,14 +54,14 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
 
     What was drawn at random stands in draws.json.
     """
-    wanted = missing_programs(points, out, launch.say)
-    if values := drawn(parts, points):
-        launch.say(
-            f"drawn with seed {', '.join(str(part.seed) for part in parts if part.ranges)}: {out / 'draws.json'}"
-        )
-        with writing(out / "draws.json") as partial:
-            partial.write_text(json.dumps(values, indent=1) + "\n")
-    code = train_programs(wanted, launch)
+    with claim(out):
+        wanted = missing_programs(points, out, launch.say)
+        if values := drawn(parts, points):
+            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
+            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
+            with writing(out / "draws.json") as partial:
+                partial.write_text(json.dumps(values, indent=1) + "\n")
+        code = train_programs(wanted, launch)
     if code == 0:
         launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
         found = rows(read_all([out / name for name in points]))
@@ -79,7 +80,8 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
     Raises:
       UsageError: `out` holds a point of the same name with other settings.
     """
-    return train_programs(missing_programs(points, out, launch.say), launch)
+    with claim(out):
+        return train_programs(missing_programs(points, out, launch.say), launch)
 
 
 @dataclasses.dataclass(frozen=True)

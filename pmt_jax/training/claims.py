@@ -19,24 +19,28 @@ from typing import Any
 from ..errors import UsageError
 
 NAME = ".claim"
-_held: dict[pathlib.Path, int] = {}
+_held: dict[pathlib.Path, tuple[int, bool]] = {}  # descriptor, and whether an empty folder goes with it
 
 
 @contextlib.contextmanager
-def claim(folder: pathlib.Path) -> Iterator[None]:
-    """Keeps other processes out of an existing `folder` until the end of the block.
+def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
+    """Keeps other processes out of `folder` until the end of the block.
+
+    A folder that is not there is made. Made here, or `created` for this, it is removed where it stays empty.
 
     Raises:
       UsageError: another process has claimed it, or it cannot be written.
     """
     path = folder / NAME
     try:
+        created |= not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
         file, locked = _open(path)
         owner = _read(file)
         if _may_be_alive(owner, locked):
             os.close(file)
             raise _refusal(folder, owner)
-        _held[path] = file
+        _held[path] = file, created
         _write(file)
     except OSError as error:
         _release(path)
@@ -54,10 +58,12 @@ def release_all() -> None:
 
 
 def _release(path: pathlib.Path) -> None:
-    file = _held.pop(path, None)
-    if file is not None:
+    if path in _held:
+        file, created = _held.pop(path)
         with contextlib.suppress(OSError):
             path.unlink()
+            if created:
+                path.parent.rmdir()
         os.close(file)
 
 

@@ -36,7 +36,8 @@ def diagnose(setup: Setup, index: int, row: Row, finite: bool) -> str | None:
     """
     steps = setup.config.batch_size * setup.config.log_interval
     share = row["non_finite"] / steps
-    where = f"of seed {row['seed']} at step {row['step']:,}"
+    whose = "" if setup.trials else f"of seed {row['seed']} "
+    where = f"{whose}at step {row['step']:,}"
     if share > MOST:
         return (
             f"{share:.0%} of the environment steps {where} were not finite; check the observations, rewards, costs and "

@@ -49,19 +49,15 @@ def create(setup: Setup) -> pathlib.Path:
 
 
 def check_out(out: pathlib.Path, resume: bool) -> None:
-    """Whether `out` can be a run's folder, as far as that can be said before it is claimed; creates it.
+    """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
 
     Raises:
-      UsageError: it is a file, cannot be written, or holds no run to resume.
+      UsageError: it is a file, or holds no run to resume.
     """
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, not a folder; choose another --out")
     if resume and not (out / "config.toml").is_file():
         raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}; choose another --out") from None
 
 
 def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> None:

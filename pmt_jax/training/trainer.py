@@ -92,10 +92,10 @@ def _claim_folder(
     stack: contextlib.ExitStack, setup: Setup, out: pathlib.Path | None, resume: bool, say: Say
 ) -> pathlib.Path:
     """The run folder, which belongs to this process until `stack` closes."""
-    if out is None:
-        out = run_folder.create(setup)
+    created = out is None
+    out = out or run_folder.create(setup)
     run_folder.check_out(out, resume)
-    stack.enter_context(claims.claim(out))
+    stack.enter_context(claims.claim(out, created))
     run_folder.check_content(out, setup, resume, say)
     return out
 

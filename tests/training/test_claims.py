@@ -115,6 +115,28 @@ def test_training_and_resuming_in_a_folder_in_use_is_refused(tmp_path: pathlib.P
     assert [path.name for path in tmp_path.iterdir()] == ["config.toml"]
 
 
+def test_a_sweep_has_its_folder_to_itself(tmp_path: pathlib.Path, cli):
+    words = ("sweep", "lane", "--set", "clip=0.1,0.2", "--out")
+    with claims.claim(tmp_path):
+        assert f"{tmp_path} is in use by process {os.getpid()}" in cli(*words, tmp_path)[2]
+    begun = tmp_path / ".group-1" / "run"
+    with claims.claim(begun):
+        (tmp_path / ".group-1" / "points").mkdir()
+        (tmp_path / ".group-1" / "points" / "clip=0.1.toml").write_text('task = "lane"\nclip = 0.1\n')
+        code, _, err = cli("sweep", "lane", "--set", "clip=0.1", "--out", tmp_path, "--method", "mappo_l")
+        assert code == 2 and f"{begun} is in use" in err
+    assert not (tmp_path / claims.NAME).exists()
+
+
+def test_an_empty_folder_that_was_made_goes_with_its_claim(tmp_path: pathlib.Path):
+    with claims.claim(tmp_path / "a" / "b"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a"] and not list((tmp_path / "a").iterdir())
+    with claims.claim(tmp_path / "a"), claims.claim(tmp_path / "c", created=True):
+        (tmp_path / "c" / "config.toml").touch()
+    assert (tmp_path / "a").is_dir() and (tmp_path / "c" / "config.toml").exists()
+
+
 def test_default_folders_differ_and_stay_in_runs(tmp_path: pathlib.Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_folder.time, "strftime", lambda form: "20260101-000000")
