@@ -1,4 +1,4 @@
-"""Trained policies without the training: as a function, and as files that need neither pmt_jax nor, if wished, JAX."""
+"""Trained policies as files that need neither pmt_jax nor, with the NumPy loader, JAX."""
 
 from __future__ import annotations
 

@@ -41,8 +41,8 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     with contextlib.ExitStack() as stack:
         for task in plans:
             stack.enter_context(claim(out / task))
-        wanted = [missing_programs(points, out / task, launch.say) for task, points in plans.items()]
-        code = train_programs([program for programs in wanted for program in programs], launch)
+        missing = [missing_programs(points, out / task, launch.say) for task, points in plans.items()]
+        code = train_programs([program for programs in missing for program in programs], launch)
     if code:
         return code
     logs = read_all([out / task / point for task, points in plans.items() for point in points])

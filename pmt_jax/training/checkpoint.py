@@ -1,8 +1,8 @@
 """Learner states on disk: orbax's atomic steps, each holding one flat table {path: array} as the bytes of an npz.
 
-Flat, because orbax refuses typed keys and empty leaves, and because partial loads of trees are silent: here the two
-sets of paths are compared, and a difference is a sentence. Bytes with a checksum, because orbax hands back a flipped
-bit without a word, and answers a lost one with a traceback for each of hundreds of arrays.
+Flat, because orbax refuses typed keys and empty leaves, and loads parts of trees without an error: here the two sets
+of paths are compared, and a difference is an error. Bytes with a checksum, because orbax does not notice a flipped
+bit, and reports a lost one with a traceback for each of hundreds of arrays.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..learning import sharding
 from . import processes
 
 KEEP = 2
-_INFO = ".rollout.vector.env.info["  # in the path of what environments told
+_INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -41,8 +41,8 @@ def pack(tree: Any) -> dict[str, np.ndarray]:
 def unpack(packed: dict[str, np.ndarray], like: Any) -> Any:
     """The inverse of `pack`; `like` gives structure, shapes and dtypes.
 
-    What an environment's last step told besides (`info`) may differ: nobody goes on from it, and so a task may come to
-    tell more without making older checkpoints useless. What is not there is 0.
+    The environments' `info` may differ, because training does not continue from it: a task may add to it, and older
+    checkpoints can still be read. What is missing is 0.
 
     Raises:
       UsageError: paths, shapes or dtypes differ.
@@ -88,13 +88,13 @@ def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class Checkpoints:
-    """The checkpoints of a run folder, named by their step, the last `KEEP` of them kept.
+    """The checkpoints of a run folder, named by their step; the newest `KEEP` are kept.
 
-    Of several processes, all must call the methods, and the first does what there is to do.
+    Of several processes, all must call the methods, and the first reads and writes.
     """
 
     def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
-        """Opens the checkpoints of `folder`; `read_only` changes nothing on disk, so that looking is always allowed."""
+        """Opens the checkpoints of `folder`; `read_only` changes nothing on disk."""
         self._folder = (folder / "checkpoints").absolute()
         self._manager: Any = None
         processes.by_first(lambda: self._open(read_only))
@@ -115,7 +115,7 @@ class Checkpoints:
             self._manager = ocp.CheckpointManager(self._folder, options=options)
 
     def save(self, step: int, tree: Any) -> None:
-        """Writes `tree` as the checkpoint after `step` environment steps; a crash meanwhile leaves the older whole.
+        """Writes `tree` as the checkpoint after `step` environment steps; a crash meanwhile leaves the older one whole.
 
         Raises:
           OSError: it could not be written (a full disk, a quota, a share that went away).
@@ -141,7 +141,7 @@ class Checkpoints:
         """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
 
         Args:
-          warn: told of every newer one that cannot be read.
+          warn: called with a sentence for every newer one that cannot be read.
 
         Raises:
           UsageError: there is none, or it belongs to another kind of run.
@@ -167,11 +167,11 @@ class Checkpoints:
         raise UsageError(f"there is no finished checkpoint in {self._folder}; train the run first")
 
     def forget_after(self, step: int) -> None:
-        """Deletes the checkpoints of later steps, from which nobody could continue."""
+        """Deletes the checkpoints of later steps, from which the run does not continue."""
         processes.by_first(lambda: [self._manager.delete(s) for s in self._manager.all_steps() if s > step])
 
     def close(self) -> None:
-        """Lets go of the folder."""
+        """Closes the folder."""
         if self._manager is not None:
             self._manager.close()
 

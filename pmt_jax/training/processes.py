@@ -1,6 +1,6 @@
-"""Several processes, on one host or many, that run the same program: how they meet and how they stay together.
+"""Several processes, on one host or many, that run the same program.
 
-Only the first touches files and speaks; the others follow what it found, and all stop together.
+Only the first process reads, writes and prints; the others receive its results, and all stop after the same row.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ T = TypeVar("T")
 
 
 def join(coordinator: str | None, process: int | None, processes: int | None) -> None:
-    """Meets the other processes of the job, as the arguments or else SLURM's step say; alone, there are none to meet.
+    """Connects to the other processes of the job, if the arguments or SLURM's step name any.
 
-    Must come before anything asks JAX for devices.
+    It must be called before JAX is asked for devices.
 
     Args:
       coordinator: HOST:PORT at which the first process listens; process: which one this is; processes: how many.
 
     Raises:
-      UsageError: the arguments do not fit, or the others cannot be met.
+      UsageError: the arguments contradict each other, or the other processes cannot be reached.
     """
     given = {"--coordinator": coordinator, "--process": process, "--processes": processes}
     missing = [flag for flag, value in given.items() if value is None]
@@ -50,16 +50,16 @@ def join(coordinator: str | None, process: int | None, processes: int | None) ->
     try:
         jax.distributed.initialize(coordinator, processes, process, cluster_detection_method=detection)
     except RuntimeError as error:
-        raise UsageError(f"cannot meet the other processes: {str(error).splitlines()[0]}") from error
+        raise UsageError(f"cannot reach the other processes: {str(error).splitlines()[0]}") from error
     _share_cpus()
 
 
 def make_room(several: bool = False) -> None:
-    """Gives XLA's CPU devices, where they are more than one or in `several` processes, more threads than cores.
+    """Sets more threads than cores for XLA's CPU devices, where they are several or in `several` processes.
 
-    A collective keeps a thread of the pool until its partners come, and devices reach theirs in any order: with no
-    more threads than devices, all may wait for each other until XLA ends the process after 40 s. Must come before
-    anything asks JAX for devices.
+    A collective holds a thread of the pool until all devices have reached it, and devices reach theirs in any order:
+    with no more threads than devices they may deadlock, and XLA ends the process after 40 s. It must be called before
+    JAX is asked for devices.
     """
     made = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if made or (several and getattr(jax.config, "jax_platforms", None) == "cpu"):
@@ -72,7 +72,7 @@ def in_step() -> bool:
 
 
 def _share_cpus() -> None:
-    """Each of the processes that could use the same CPUs takes its part of them."""
+    """Divides CPUs that several processes could use among these."""
     if not hasattr(os, "sched_setaffinity"):
         return
     cpus = sorted(os.sched_getaffinity(0))
@@ -84,7 +84,7 @@ def _share_cpus() -> None:
 
 
 def is_first() -> bool:
-    """Whether this process is the one that touches files and speaks."""
+    """Whether this process is the one that reads, writes and prints."""
     return jax.process_index() == 0
 
 
@@ -99,22 +99,22 @@ def by_first(action: Callable[[], T]) -> T:
     """What `action` returns in the first process, in all of them; all must call it at the same point.
 
     Raises:
-      what `action` raises, in the first process; there, the others leave quietly with the code of `pmt` for it.
+      what `action` raises, in the first process; the others exit with the code of `pmt` for it and print nothing.
     """
     if jax.process_count() == 1:
         return action()
-    failure, told = None, b""
+    failure, sent = None, b""
     if is_first():
         try:
-            told = pickle.dumps((0, action()))
-        except Exception as error:  # whatever it is, the others wait to hear of it
-            failure, told = error, pickle.dumps((2 if isinstance(error, UsageError) else 1, None))
-    buffer = np.zeros(agree(len(told)), np.uint8)
-    buffer[: len(told)] = np.frombuffer(told, np.uint8)
-    heard = multihost_utils.broadcast_one_to_all(buffer)
+            sent = pickle.dumps((0, action()))
+        except Exception as error:  # whatever it is, the others wait for a result
+            failure, sent = error, pickle.dumps((2 if isinstance(error, UsageError) else 1, None))
+    buffer = np.zeros(agree(len(sent)), np.uint8)
+    buffer[: len(sent)] = np.frombuffer(sent, np.uint8)
+    received = multihost_utils.broadcast_one_to_all(buffer)
     if failure is not None:
         raise failure
-    code, result = pickle.loads(np.asarray(heard).tobytes())
+    code, result = pickle.loads(np.asarray(received).tobytes())
     if code:
         raise SystemExit(code)
     return result

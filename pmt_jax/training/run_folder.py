@@ -1,4 +1,4 @@
-"""A run folder: what may be written into it, what is in it, and whether a run may go on there."""
+"""A run folder: what it holds, and whether a run may start or continue there."""
 
 from __future__ import annotations
 
