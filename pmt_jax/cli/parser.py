@@ -89,16 +89,6 @@ def pixels(text: str) -> tuple[int, int]:
     return width, height
 
 
-def run_folder(text: str) -> pathlib.Path:
-    """The type of a run folder that holds metrics."""
-    if text.startswith("hub:"):
-        raise argparse.ArgumentTypeError(
-            f"must be run folders, which hold the metrics of training, not the pretrained policy '{text}'; pmt eval "
-            "and pmt render take one"
-        )
-    return pathlib.Path(text)
-
-
 def names(text: str) -> list[str]:
     """The type of words with commas between them."""
     return [name for name in text.split(",") if name]

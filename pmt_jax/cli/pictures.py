@@ -7,7 +7,7 @@ import pathlib
 from typing import Any
 
 from ..output import say
-from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, run_folder, span, whole
+from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, span, whole
 from .process import at_once
 
 
@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
         description="Reward, cost, violations, multiplier and emotions over training; runs that differ in nothing but "
         "their seeds make one curve: the mean over seeds, in a band from the lowest to the highest.",
     )
-    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=run_folder, help="run folders")
+    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
     add_out(plot, "curves.png")
 
     report = command(
@@ -56,7 +56,7 @@ def add(commands: Any) -> None:
         "everything about runs on one page: pmt report runs/* -o report.html",
         description="Settings, versions, curves, an evaluation with intervals and a replay, in one file.",
     )
-    report.add_argument("run_folders", metavar="RUN", nargs="+", type=run_folder, help="run folders")
+    report.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
     add_out(report, "report.html")
     report.add_argument(
         "--episodes", type=whole(1), default=32, metavar="N", help="of the evaluation, per seed (default 32)"

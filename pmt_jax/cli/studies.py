@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import UsageError
 from ..output import say
 from .flags import add_settings, given
-from .parser import SOURCE, add_format, add_jobs, command, run_folder, whole
+from .parser import SOURCE, add_format, add_jobs, command, whole
 from .process import at_once, refuse_many
 
 
@@ -55,7 +55,7 @@ def _add_table(commands: Any) -> None:
         "compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
         description="One row per task, method and settings: interquartile means with 95 % intervals.",
     )
-    table.add_argument("sources", nargs="+", type=run_folder, metavar="RUN", help="run folders, or folders of them")
+    table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
     table.add_argument("--test", action="store_true", help="also test against it: Mann-Whitney's U, Holm's correction")
     add_format(table)

@@ -55,13 +55,6 @@ def test_it_is_executed_where_it_is_trusted_or_in_the_working_folder(place: path
     assert "has no class or function 'Env'" in cli("eval", "run")[2]
 
 
-@pytest.mark.parametrize("command", ["plot", "report", "table"])
-def test_pretrained_policies_have_no_curves(command: str, cli):
-    code, _, err = cli(command, "hub:ant_2x4/r4sg")
-    assert code == 2 and "not the pretrained policy 'hub:ant_2x4/r4sg'; pmt eval and pmt render take one" in err
-    assert err.count("\n") == 1
-
-
 def test_an_export_appears_whole(place: pathlib.Path):
     from pmt_jax.files import writing_folder
 

@@ -10,11 +10,11 @@ import types
 
 import pytest
 from rich.console import Console
-from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 from places import ROOT
 from pmt_jax.training import metrics
 from pmt_jax.training.progress import COLUMNS, Progress
+from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 
 def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
