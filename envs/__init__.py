@@ -18,7 +18,7 @@ from .errors import TaskError, did_you_mean
 if TYPE_CHECKING:
     from .base import Env
 
-__pmt__ = "pmt-jax"  # tells our `envs` from the unrelated package of that name on PyPI
+__pmt__ = "pmt-jax"  # distinguishes this package from the unrelated `envs` on PyPI
 
 
 class _Task(NamedTuple):
@@ -46,7 +46,7 @@ _TASKS = {
 
 
 def names() -> list[str]:
-    """The tasks `make` knows."""
+    """The tasks that `make` builds."""
     return sorted(_TASKS)
 
 
@@ -74,7 +74,7 @@ def make(name: str, **options: Any) -> Env:
 
 
 def columns(name: str) -> Mapping[str, Column]:
-    """The figures of a task's `info` that tables show, by their name in `info`; none for tasks that are not ours."""
+    """The figures of a task's `info` that tables show, by their name in `info`; none for a task in a file."""
     return _TASKS[name].columns if name in _TASKS else {}
 
 
@@ -89,7 +89,7 @@ def task_options(name: str) -> dict[str, Any]:
 
 
 def explain_options(name: str) -> str:
-    """What a task's docstring says of its arguments; '' where it says nothing.
+    """The arguments in a task's docstring; '' where it has none.
 
     Raises:
       TaskError: unknown name.

@@ -104,7 +104,7 @@ class State:
 class Env(Protocol):
     """What `envs.make` returns: these four are required. All methods are pure and can be jitted and vmapped.
 
-    A fifth is optional: `declares`, the `Declarations` of what only the task knows. The tasks of this package also have
+    A fifth is optional: `declares`, the `Declarations`. The tasks of this package also have
     `raw(state)`, the quantities of a state by name, and `restore(**raw)`, a State made of them: `restore(**raw(state))`
     continues exactly as `state` would, so that recorded transitions can be replayed.
     """
@@ -180,7 +180,7 @@ class NetworkMap:
 
 @dataclasses.dataclass(frozen=True)
 class Declarations:
-    """What only a task knows and generic code asks for; every field has a default.
+    """What only the task defines and generic code needs; every field has a default.
 
     The names of its columns in tables are declared in the registry of `envs`, which can be read without JAX.
 

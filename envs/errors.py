@@ -1,4 +1,4 @@
-"""What the environments say when the caller made a mistake; imports nothing heavy."""
+"""Errors of the environments, one sentence each, and checks that raise them; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 
 class TaskError(ValueError):
-    """A mistake of the caller's, told in one sentence: what was wrong, what was expected, what to do."""
+    """A mistake of the caller's, in one sentence: what was wrong, what was expected, what to do."""
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:

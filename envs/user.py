@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from .base import Env, EnvSpec
 
 _NAME = re.compile(r"(.*\.py)(?::(\w+))?")
-NEEDS = ("spec", "engine", "reset", "step")  # what training asks of an environment
+NEEDS = ("spec", "engine", "reset", "step")  # what training needs of an environment
 
 
 def is_file(name: str) -> bool:
-    """Whether `name` means a Python file and not a task of ours."""
+    """Whether `name` means a Python file and not a registered task."""
     return _NAME.fullmatch(name) is not None
 
 
 def _split(name: str) -> tuple[pathlib.Path, str | None]:
     match = _NAME.fullmatch(name)
-    assert match is not None, name  # whoever comes here has asked `is_file`
+    assert match is not None, name  # callers check `is_file` first
     return pathlib.Path(match[1]).absolute(), match[2]
 
 
@@ -175,10 +175,10 @@ def _check_values(env: Env, name: str) -> None:
 
 
 def _guard(what: str, run: Callable[[], Any]) -> Any:
-    """Runs code of the user's; whatever it raises becomes one sentence with the line it came from."""
+    """Runs code of the user's and turns what it raises into one sentence with its line."""
     try:
         return run()
-    except Exception as error:  # anything can go wrong in a file that we have not written
+    except Exception as error:  # a user's file may raise anything
         lines = traceback.extract_tb(error.__traceback__)
         own = [line for line in lines if pathlib.Path(line.filename).parent != pathlib.Path(__file__).parent]
         line = (own or lines)[-1]

@@ -1,4 +1,4 @@
-"""Any task of ours as other libraries know environments: gymnasium, PettingZoo, brax.
+"""Tasks as environments of other libraries: gymnasium, PettingZoo, brax.
 
 The library is imported when its adapter is first asked for (`pip install "pmt-jax[adapters]"` brings all three).
 
@@ -73,7 +73,7 @@ def to_brax(env: Env) -> BraxEnv:
 
 
 def _adapter(library: str, module: str) -> types.ModuleType:
-    """The module that speaks to `library`, imported only now."""
+    """The module of the adapter to `library`, imported on first use."""
     try:
         return importlib.import_module(f".{module}", __name__)
     except ModuleNotFoundError as error:

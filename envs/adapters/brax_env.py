@@ -28,7 +28,7 @@ class BraxEnv(brax_envs.Env):
         """One control step with the team's `action` [N * A]."""
         mask = jnp.asarray(self._env.spec.action_mask)
         view = self._view(self._env.step(cast(State, state.pipeline_state), action.reshape(mask.shape) * mask))
-        view["metrics"] = {**state.metrics, **view["metrics"]}  # brax's wrappers add theirs and want them back
+        view["metrics"] = {**state.metrics, **view["metrics"]}  # brax's wrappers add theirs and expect them back
         return dataclasses.replace(state, **view)
 
     @property
@@ -43,7 +43,7 @@ class BraxEnv(brax_envs.Env):
 
     @property
     def backend(self) -> str:
-        """Our physics engine's name."""
+        """The physics engine's name."""
         return self._env.engine
 
     def _view(self, state: State) -> dict[str, Any]:

@@ -37,11 +37,11 @@ class PettingZooParallel(pettingzoo.ParallelEnv):
         self._global_state: Any = None
 
     def observation_space(self, agent: str) -> Space:
-        """What `agent` sees: [O], always the same object."""
+        """`agent`'s observations: [O], always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Space:
-        """What `agent` can do: its own action entries, each in [-1, 1]; always the same object."""
+        """`agent`'s actions: its own entries, each in [-1, 1]; always the same object."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByAgent, ByAgent]:

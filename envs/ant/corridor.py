@@ -1,8 +1,8 @@
 """The ant in the zig-zag corridor of Safe Multi-Agent MuJoCo (Gu et al., 2023): tasks `ant_2x4` and `ant_4x2`.
 
 One ant of eight motors, shared out among 2 or 4 agents, runs along +x between two walls that zig-zag by 30 degrees.
-Written from the facts of the public reference code and checked against transitions recorded from it; paper and code
-differ in places, and then this is the code.
+Written from the facts of the public reference code and checked against transitions recorded from it. Where paper and
+code differ, the task follows the code.
 
 Example:
   >>> import jax, envs
@@ -59,7 +59,7 @@ COSTLY_BAND = 0.36  # and the danger bands less transparent
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Carry:
-    """What the ant remembers between control steps.
+    """The state between control steps.
 
     Attributes:
       physics: the engine's state.
@@ -140,7 +140,7 @@ class AntCorridor:
         )
         qvel = RESET_VELOCITY_NOISE * jax.random.normal(velocity_key, start.qvel.shape, start.qvel.dtype)
         quaternion = qpos[3:7] / jnp.linalg.norm(qpos[3:7])
-        return self._first(PhysicsState(qpos.at[3:7].set(quaternion), qvel, start.warmstart), qpos[:3])
+        return self._initial_state(PhysicsState(qpos.at[3:7].set(quaternion), qvel, start.warmstart), qpos[:3])
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step of 0.05 s with `action` [N, A]; the motors saturate at 1, the control cost does not."""
@@ -151,7 +151,7 @@ class AntCorridor:
         terminated = self._get_termination(after, out["torso_xquat"])
         cost, cost_parts = self._get_cost(out["torso_xpos"], terminated)
         obs, global_state = self._get_obs(after)
-        info = reward_parts | cost_parts | _place(out["torso_xpos"]) | {"physics_overflow": out["overflow"]}
+        info = reward_parts | cost_parts | _location(out["torso_xpos"]) | {"physics_overflow": out["overflow"]}
         return State(obs, global_state, reward, cost, terminated, info, Carry(after, out["torso_xpos"]))
 
     def restore(self, qpos: Any, qvel: Any, warmstart: Any = None, torso_xpos: Any = None) -> State:
@@ -171,7 +171,7 @@ class AntCorridor:
         # A unit quaternion is left alone to the last bit, so that `raw` and `restore` are inverses.
         norm = jnp.linalg.norm(qpos[3:7])
         quaternion = jnp.where(jnp.abs(norm - 1.0) > 1e-5, qpos[3:7] / norm, qpos[3:7])
-        return self._first(PhysicsState(qpos.at[3:7].set(quaternion), qvel, warmstart), torso_xpos)
+        return self._initial_state(PhysicsState(qpos.at[3:7].set(quaternion), qvel, warmstart), torso_xpos)
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -199,13 +199,13 @@ class AntCorridor:
             elif model().geom(geom.objid).name.startswith("danger"):
                 geom.rgba[3] = COSTLY_BAND
 
-    def _first(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
+    def _initial_state(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
         """A State that no transition led to."""
         obs, global_state = self._get_obs(physics)
         zero = jnp.zeros((), torso_xpos.dtype)
         names = ("forward", "ctrl", "contact", "survive")
         info = {f"reward_{name}": zero for name in names} | {"cost_obj": zero, "cost_done": zero}
-        info |= _place(torso_xpos) | {"physics_overflow": zero}
+        info |= _location(torso_xpos) | {"physics_overflow": zero}
         cost = jnp.zeros((self.spec.num_agents, 1), zero.dtype)
         return State(obs, global_state, zero, cost, jnp.zeros((), bool), info, Carry(physics, torso_xpos))
 
@@ -262,7 +262,7 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
     return y - centre
 
 
-def _place(torso: jax.Array) -> dict[str, jax.Array]:
+def _location(torso: jax.Array) -> dict[str, jax.Array]:
     """How far the ant is along x (m), and 1 where it is outside: walls do not block, nor is it costly behind them."""
     outside = jnp.abs(off_centre(torso[0], torso[1])) > HALF_WIDTH
     return {"x_position": torso[0], "outside": outside.astype(torso.dtype)}

@@ -11,7 +11,7 @@ throwing hand's index finger: the cost is a function of the action alone, which 
 | `hand_over_safe_joint`  | as 2x6                      | 4                                   | 0.5    |
 | `hand_over_safe_finger` | as 2x6                      | any of 2, 3, 4 (FFJ3, FFJ2, FFJ1)   | 0.5    |
 
-Written from the facts of the public reference task; `docs/hand_over.md` says what differs from Isaac Gym and why.
+Written from the facts of the public reference task; `docs/hand_over.md` lists what differs from Isaac Gym and why.
 
 Example:
   >>> import jax, envs
@@ -140,7 +140,7 @@ def model(object: str = "egg", capsule: bool = False, full_hand: bool = False) -
 
 
 class HandOver:
-    """See the module; agents share reward and cost, an agent sees its own hand, the object and the goal.
+    """See the module; agents share reward and cost, an agent observes its own hand, the object and the goal.
 
     Args:
       variant: one of `VARIANTS`.
@@ -299,7 +299,7 @@ class HandOver:
         overflow: jax.Array,
     ) -> State:
         obs, global_state = self._get_obs(carry, tips)
-        distance, angle = _errors(carry)
+        distance, angle = _goal_errors(carry)
         info = {"distance": distance, "angle": angle, "physics_overflow": overflow}
         return State(obs, global_state, reward, cost, terminated, info, carry)
 
@@ -346,7 +346,7 @@ class HandOver:
 
     def _get_reward(self, carry: Carry) -> jax.Array:
         """[] in (0, 1]: exp(-10 d - 0.2 theta), the object being d (m) away from the goal and turned by theta (rad)."""
-        distance, angle = _errors(carry)
+        distance, angle = _goal_errors(carry)
         return jnp.exp(-10.0 * distance - 0.2 * angle)
 
     def _get_cost(self, joint_action: jax.Array) -> jax.Array:
@@ -374,7 +374,7 @@ def _random_turn(u: jax.Array) -> jax.Array:
     return _multiply(jnp.stack([cos[0], sin[0], zero, zero]), jnp.stack([cos[1], zero, sin[1], zero]))
 
 
-def _errors(carry: Carry) -> tuple[jax.Array, jax.Array]:
+def _goal_errors(carry: Carry) -> tuple[jax.Array, jax.Array]:
     """Distance (m) and angle (rad, 0 to pi) of the object from the goal."""
     qpos = carry.physics.qpos
     distance = jnp.linalg.norm(qpos[HINGES : HINGES + 3] - jnp.asarray(GOAL, qpos.dtype))

@@ -2,7 +2,7 @@
 
 | engine   | where         | what it is                                                          |
 |----------|---------------|---------------------------------------------------------------------|
-| `mujoco` | CPU           | MuJoCo's C engine on a team of threads, called by XLA once per step |
+| `mujoco` | CPU           | MuJoCo's C engine on threads, called by XLA once per step           |
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
 | `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                             |
 

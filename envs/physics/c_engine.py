@@ -1,4 +1,7 @@
-"""The `mujoco` engine: MuJoCo's C engine on a team of threads, called by XLA once per control step."""
+"""The `mujoco` engine: MuJoCo's C engine on threads, called by XLA once per control step.
+
+A step is run by `native_batch`, or by `thread_team` where a readout needs `mj_rnePostConstraint`.
+"""
 
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
@@ -6,28 +9,26 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import copy
 import functools
 import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
-from queue import SimpleQueue
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..errors import TaskError
+from ..errors import at_least
 from .contract import PhysicsState, Readout, needs_post_constraint, rest_state, usable_cpus
 from .host_call import GivenUp, host_call, register
+from .native_batch import BatchSteps, forget_batches
+from .thread_team import TeamSteps, after_step, forget_threads
 
 
 class CEngine:
-    """MuJoCo's C engine on a team of threads, called from inside the jitted program once per control step.
+    """MuJoCo's C engine on threads, called from inside the jitted program once per control step.
 
     The numbers depend on neither the number of threads nor which of them advances which environment.
     """
@@ -35,18 +36,19 @@ class CEngine:
     name = "mujoco"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None):
-        if threads is not None and threads < 1:
-            raise TaskError(f"threads must be at least 1, not {threads}")
+        threads = usable_cpus() if threads is None else int(at_least("threads", threads, 1))
         _prepare_process()
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if model.ntree == 1:  # one tree is one island; the search for it takes 6 % of a step and changes no bit
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-        self._model, self._substeps, self._readout = model, substeps, dict(readout)
-        self._threads = threads or usable_cpus()
-        first = _Worker(model, substeps, readout)
-        self._idle = [first]  # as many as ever worked at once
-        self._parts, self._width = first.parts, first.width
+        self._model, self._readout = model, dict(readout)
+        runner = TeamSteps if needs_post_constraint(readout) else BatchSteps
+        self._runner = runner(model, substeps, readout, threads)
+        views = after_step(mujoco.MjData(model), readout)
+        ends = np.cumsum([view.size for view in views]).tolist()
+        self._parts = [(slice(end - view.size, end), view.shape) for view, end in zip(views, ends, strict=True)]
+        self._width = ends[-1]
         self._target = register(self._advance)
 
     def start(self) -> PhysicsState:
@@ -60,176 +62,35 @@ class CEngine:
         return PhysicsState(qpos, qvel, warmstart), out | {"overflow": jnp.zeros((), qpos.dtype)}
 
     def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
-        """The host's side: qpos, qvel, warm start and ctrl [..., D] to what `_Worker` writes [..., E]."""
+        """The host's side: qpos, qvel, warm start and ctrl [..., D] to the state and the readouts [..., E]."""
         if _leaving.is_set():
             raise GivenUp("the interpreter is shutting down")
         _running.append(None)
+        rows, out = argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width)
         try:
-            self._advance_rows(argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width))
+            sound = np.isfinite(rows).all(axis=1)
+            out[~sound] = np.nan  # broken before the step
+            self._runner.advance(rows, np.flatnonzero(sound), out)
         except KeyboardInterrupt:  # XLA runs short programs on the main thread; this cannot unwind through C
             raise GivenUp("interrupted in a physics step (Ctrl-C)") from None
         finally:
             _running.pop()
 
-    def _advance_rows(self, rows: np.ndarray, out: np.ndarray) -> None:
-        todo: Collection[int] = range(len(rows))
-        if not np.isfinite(rows).all():
-            sound = np.isfinite(rows).all(axis=1)
-            out[~sound] = np.nan  # broken before the step
-            todo = np.flatnonzero(sound).tolist()
-        # The threads draw rows from one iterator (atomic in CPython), so a slow thread delays nobody.
-        queue, states = iter(todo), rows.astype(np.float64)
-        _team.share(lambda: self._work(queue, states, out), queue, min(self._threads, len(todo)))
 
-    def _work(self, queue: Iterator[int], states: np.ndarray, out: np.ndarray) -> None:
-        try:
-            worker = self._idle.pop()
-        except IndexError:
-            worker = _Worker(self._model, self._substeps, self._readout)
-        _thread.quiet = True
-        try:
-            for row in queue:
-                worker.advance(states[row], out[row])
-            worker.check_memory()
-        finally:
-            _thread.quiet = False
-        self._idle.append(worker)
-
-
-_PACKED = int(
-    mujoco.mjtState.mjSTATE_QPOS
-    | mujoco.mjtState.mjSTATE_QVEL
-    | mujoco.mjtState.mjSTATE_WARMSTART
-    | mujoco.mjtState.mjSTATE_CTRL
-)  # what a control step starts from, in the order in which MuJoCo packs it
-
-
-class _Worker:
-    """One thread's mjData, with the array views that are read and written every control step."""
-
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
-        self._model = model
-        self._steps = [(model, substeps)]
-        if model.nsensor and substeps > 1:  # nobody reads the sensors before the last
-            unsensed = copy.copy(model)
-            unsensed.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-            self._steps = [(unsensed, substeps - 1), (model, 1)]
-        self._data = data = mujoco.MjData(model)
-        self._post_constraint = needs_post_constraint(readout)
-        self._warnings = data.warning
-        for warning in data.warning:
-            warning.number = 1  # C reports the first of each kind only
-        self._outputs = [data.qpos, data.qvel, data.qacc_warmstart]
-        readouts = [getattr(data, field)[index] for field, index in readout.values()]
-        self._outputs += [view.reshape(-1) for view in readouts]
-        ends = np.cumsum([view.size for view in self._outputs]).tolist()
-        shapes = [view.shape for view in (*self._outputs[:3], *readouts)]
-        self.parts = [
-            (slice(end - view.size, end), shape) for view, end, shape in zip(self._outputs, ends, shapes, strict=True)
-        ]
-        self.width = ends[-1]
-
-    def advance(self, state: np.ndarray, out: np.ndarray) -> None:
-        """One control step of one environment: `state` [D] (float64) to `out` [E]."""
-        data = self._data
-        data.time = 0.0
-        mujoco.mj_setState(self._model, data, state, _PACKED)
-        for model, substeps in self._steps:
-            mujoco.mj_step(model, data, substeps)
-        if self._post_constraint:
-            mujoco.mj_rnePostConstraint(self._model, data)
-        np.concatenate(self._outputs, out=out, casting="same_kind")
-
-    def check_memory(self) -> None:
-        """Contacts that found no room were dropped by C with a warning only."""
-        kinds = mujoco.mjtWarning
-        if any(self._warnings[int(kind)].number > 1 for kind in (kinds.mjWARN_CONTACTFULL, kinds.mjWARN_CNSTRFULL)):
-            raise MemoryError("MuJoCo ran out of room for contacts; raise <size memory=.../> in the model")
-
-
-class _Team:
-    """Threads that help whichever engine calls; they start when first needed and then wait for work.
-
-    `concurrent.futures` would do, but its hand-over costs 16 ants 3 % of their speed. The threads are daemons, so that
-    nobody waits for them at exit; `_leave` sees to it that they are idle by then.
-    """
-
-    def __init__(self) -> None:
-        self.disband()
-
-    def disband(self) -> None:
-        """Forgets the threads, which do not survive a fork; new ones start when needed."""
-        self._jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._size = 0
-
-    def share(self, work: Callable[[], None], queue: Iterator[Any], threads: int) -> None:
-        """Runs `work`, which takes from `queue` until it is empty, on this thread and on `threads - 1` others.
-
-        When this returns or raises, nobody works any more: a helper that comes late finds the queue empty.
-        """
-        inside: list[None] = []  # one entry for each helper at work
-        errors: list[BaseException] = []
-        left: SimpleQueue[None] = SimpleQueue()
-
-        def assist() -> None:
-            inside.append(None)
-            try:
-                work()
-            except BaseException as error:
-                errors.append(error)
-            finally:
-                inside.pop()
-                left.put(None)
-
-        def settle() -> None:
-            for _ in queue:  # only after a failure is anything left
-                pass
-            while inside:
-                left.get()
-
-        try:
-            for _ in range(min(threads - 1, self._recruit(threads - 1))):
-                self._jobs.put(assist)
-            work()
-        finally:
-            while True:
-                try:
-                    settle()
-                    break
-                except KeyboardInterrupt:  # again: it takes no more than one environment's control step
-                    continue
-        if errors:
-            raise errors[0]
-
-    def _recruit(self, size: int) -> int:
-        """Makes the team at least that large if it can, and returns how large it is."""
-        with contextlib.suppress(RuntimeError):  # the interpreter is going down and starts no new thread
-            while self._size < size:
-                threading.Thread(target=_serve, args=[self._jobs], name="pmt-physics", daemon=True).start()
-                self._size += 1
-        return self._size
-
-
-def _serve(jobs: SimpleQueue[Callable[[], None]]) -> None:
-    while True:
-        jobs.get()()
-
-
-_team = _Team()
 _running: list[None] = []  # one entry for each host call under way
 _leaving = threading.Event()
-_thread = threading.local()  # its `quiet` is True while the thread works for us
 
 
 def _forked() -> None:
     """Makes a child's process its own: neither threads nor host calls under way came with it."""
-    _team.disband()
+    forget_threads()
+    forget_batches()
     _running.clear()
 
 
 @functools.cache
 def _prepare_process() -> None:
-    """What makes threads safe to fork and to leave, and C quiet; done once, when the first engine is built."""
+    """Makes threads safe to fork and to leave, and C quiet; once, when the first engine is built."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_forked)
     atexit.register(_leave)
@@ -238,18 +99,18 @@ def _prepare_process() -> None:
 
 
 def _hear(message: str) -> None:
-    """MuJoCo's warnings, which it would write to a MUJOCO_LOG.TXT in the working directory.
+    """Takes MuJoCo's warnings, which it would write to a MUJOCO_LOG.TXT in the working directory.
 
-    Those of our own simulations say that one is about to break, which its numbers tell the quarantine anyway.
+    Those of a host call under way say that a simulation is about to break, which its numbers show anyway.
     """
-    if not getattr(_thread, "quiet", False):
+    if not _running:
         warnings.warn(f"MuJoCo: {message}", stacklevel=2)
 
 
 def _leave() -> None:
     """Ends programs that still run when the interpreter exits: XLA's threads would call into what no longer exists."""
     _leaving.set()
-    with contextlib.suppress(Exception):  # the programs given up raise here, and nobody is left to tell
+    with contextlib.suppress(Exception):  # a program given up raises here, with no caller left
         for array in jax.live_arrays():
             with contextlib.suppress(Exception):
                 array.block_until_ready()

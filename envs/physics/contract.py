@@ -46,7 +46,7 @@ check_versions()
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PhysicsState:
-    """All that one control step needs to know of the last one.
+    """The state that one control step hands to the next.
 
     Attributes:
       qpos: [nq] positions in MuJoCo's order and units.

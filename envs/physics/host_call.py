@@ -72,7 +72,7 @@ class _Extension(ctypes.Structure):
 
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
-_Porch = ctypes.PYFUNCTYPE(None, ctypes.POINTER(_Frame))
+_Entry = ctypes.PYFUNCTYPE(None, ctypes.POINTER(_Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Error))
 
 _names = itertools.count()
@@ -104,12 +104,12 @@ def register(function: HostFunction) -> str:
         except BaseException as error:
             return _error(arguments[0].contents.api, error)
 
-    # What escapes from a callback is printed by ctypes, and XLA takes whatever lies on the stack for our answer. A
-    # `try` is no help against Ctrl-C, which strikes at the first bytecode after XLA's own work, before any `try`. So
-    # the first Python to run is a porch from which nothing needs to come back; `handle` then asks who arrived.
-    porch = _Porch(lambda _: _arrived.add(threading.get_ident()))
-    porch.errcheck = handle  # pyright: ignore[reportAttributeAccessIssue]
-    handler = _Handler(porch)
+    # ctypes prints what a callback raises, and XLA then reads whatever is on the stack as the returned error. A `try`
+    # does not help against Ctrl-C, which strikes at the first bytecode after XLA's own work, before any `try`. So the
+    # first Python to run is `entry`, whose result is not used; `handle` then checks that it ran.
+    entry = _Entry(lambda _: _arrived.add(threading.get_ident()))
+    entry.errcheck = handle  # pyright: ignore[reportAttributeAccessIssue]
+    handler = _Handler(entry)
     name = f"pmt_host_call_{next(_names)}"
     _alive.append(handler)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
@@ -123,7 +123,7 @@ def host_call(name: str, operand: jax.Array, width: int) -> jax.Array:
 
 
 def _describe(extension_address: int) -> bool:
-    """Answers XLA's question which ABI this handler speaks; False if that is not what was asked."""
+    """Reports the ABI version to XLA; False if XLA did not query it."""
     extension = _Extension.from_address(extension_address)
     if extension.type != _METADATA:
         return False
@@ -145,7 +145,7 @@ def _array(buffers: ctypes.Structure) -> np.ndarray:
 
 
 def _error(api_address: int, error: BaseException) -> int | None:
-    """Makes XLA's error of ours; XLA takes it over."""
+    """Converts an exception to XLA's error, which XLA then owns."""
     if isinstance(error, Exception) and not isinstance(error, GivenUp):
         traceback.print_exception(error)
     message = f"{type(error).__name__}: {error}".encode(errors="replace")

@@ -27,7 +27,7 @@ def check_hooks() -> None:
     """Whether the two private places of MJX that `patched` replaces are still there.
 
     Raises:
-      TaskError: they are not; this MJX needs another look before it can be trusted to agree with C.
+      TaskError: they are not; this MJX may differ from C.
     """
     import_mjx()
     from mujoco.mjx._src import collision_driver, solver
@@ -48,8 +48,8 @@ _HOOKING = threading.RLock()  # the hooks are module globals; two threads may tr
 def patched() -> Iterator[None]:
     """While MJX is being traced: C's contact frame for capsules on planes, and a better line search.
 
-    MJX's own is a scan over all iterations, for the sake of reverse-mode gradients, which nobody takes through the
-    physics here; a real loop is 1.6 times as fast at 50 iterations. And in float32 it at times stops a step early.
+    MJX's own is a scan over all iterations, for the sake of reverse-mode gradients, which are not taken through
+    the physics here; a real loop is 1.6 times as fast at 50 iterations. And in float32 it at times stops a step early.
     """
     from mujoco.mjx._src import collision_driver, solver
     from mujoco.mjx._src.types import GeomType
@@ -95,7 +95,7 @@ def _plane_capsule(model: Any, data: Any, _: Any, geoms: jax.Array) -> tuple[jax
     """Contacts [2 pairs] of planes and capsules: distance, position and frame, in the layout MJX's driver expects.
 
     As in C, the first tangent is the capsule's axis projected on the plane, however steep the capsule; MJX's own
-    function lets go of it beyond 60 degrees, which changes friction, whose cone is a pyramid along the tangents.
+    function takes another one beyond 60 degrees, which changes friction, whose cone is a pyramid along the tangents.
     """
 
     def collide(plane: jax.Array, capsule: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

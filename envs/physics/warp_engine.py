@@ -20,7 +20,7 @@ from .mjx_patches import import_mjx
 class WarpEngine:
     """MJX with the MuJoCo-Warp implementation. Its sums are atomic: runs do not repeat to the last bit.
 
-    Buffers are sized by the model (`_room`) and the batch, and every step says whether they were large enough.
+    Buffers are sized by the model (`_room`) and the batch, and every step reports whether they were large enough.
     """
 
     name = "warp"
@@ -30,7 +30,7 @@ class WarpEngine:
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
         settings = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
-        settings |= {"ncam": 0, "nlight": 0}  # nobody looks through them here, and each has a kernel a stage
+        settings |= {"ncam": 0, "nlight": 0}  # unused here, and each costs a kernel a stage
         self._model = _constant(lambda: mjx.put_model(model, impl="warp").tree_replace(settings))
         # Forces after the constraints are read at the end of a control step only; Warp works them out in each of the
         # integrator's stages, so the substeps before the last go without.
@@ -45,8 +45,8 @@ class WarpEngine:
         # computed ones did not): XLA hands such slices to a foreign call without a copy. Beyond mjMAXVAL nothing is
         # simulated anyway.
         ctrl = jnp.clip(ctrl, -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
-        lone = jax.tree.map(lambda x: x[None], (state, ctrl))
-        return jax.tree.map(lambda x: x[0], _flattened(self._step_all)(*lone))
+        single = jax.tree.map(lambda x: x[None], (state, ctrl))
+        return jax.tree.map(lambda x: x[0], _flattened(self._step_all)(*single))
 
     def _step_all(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
         """One control step of a batch: all arrays have a leading [B]."""
@@ -80,8 +80,8 @@ class WarpEngine:
 def _constant(make: Callable[[], Any]) -> Any:
     """What `make` builds of JAX arrays, as NumPy's, wherever it is called from.
 
-    MJX asks for its arrays' shapes per shard, which inside a `shard_map` nobody can say, so `make` runs outside of any
-    mesh; and an array that lies on one device is no constant of a program for several.
+    MJX reads its arrays' shapes per shard, which are undefined inside a `shard_map`, so `make` runs outside of any
+    mesh. An array that lies on one device cannot be a constant of a program for several.
     """
     with jax.ensure_compile_time_eval(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         return jax.tree.map(np.asarray, make())

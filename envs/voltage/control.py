@@ -1,10 +1,11 @@
 """Active voltage control on distribution networks (MAPDN, Wang et al., 2021): tasks `voltage_33` and `voltage_141`.
 
-Photovoltaic plants of a feeder are the agents. Every 3 minutes each sets its inverter's reactive power; all want bus
-voltages within 0.95 and 1.05 p.u., little reactive power, and small losses. Pure JAX: power flow, data and all.
+Photovoltaic plants of a feeder are the agents. Every 3 minutes each sets its inverter's reactive power. The team is
+rewarded for bus voltages within 0.95 and 1.05 p.u., little reactive power, and small losses. All of it is pure JAX,
+power flow and data included.
 
 Written from the facts of the public environment and checked against rollouts recorded from it, oddities included: after
-a reset the first data row is used twice (with fresh noise), and what an agent sees mixes the solved row with the next.
+a reset the first data row is used twice (with fresh noise), and observations mix the solved row with the next.
 
 Example:
   >>> import jax, envs
@@ -41,7 +42,7 @@ COST_LIMIT = 4.8  # 2 % of an episode's 239 steps, that is a controllable rate o
 VOLTAGE_WEIGHT, Q_WEIGHT = 1.0, 0.1
 COLLAPSE_PENALTY = 200.0
 INVERTER_HEADROOM = 1.2  # apparent power rating over the largest active power
-MAX_RESETS = 1000  # dates tried until one can be solved; MAPDN tries for ever
+MAX_RESETS = 1000  # dates tried until one can be solved; MAPDN has no limit
 BLOCKS = ("demand", "pv", "reactive", "vm_pu", "va_degree")
 BARRIERS = ("l1", "l2", "bowl", "courant_beltrami", "bump")
 COSTS = ("any", "share", "excess_sum", "excess_mean")
@@ -55,7 +56,7 @@ class Scenario:
     Attributes:
       name: the network's name.
       network: for the power flow, injections allowed at load and PV buses.
-      table: load_bus [n_load], pv_bus [n_pv] in agent order, zone [n] (0 is nobody's), p0, q0 [n_load] nominal MW and
+      table: load_bus [n_load], pv_bus [n_pv] in agent order, zone [n] (0 is no region), p0, q0 [n_load] nominal MW and
         MVAr, s_max [n_pv] MVA (used only to scale generated profiles).
       action_scale: of the largest reactive power, at action 1.
       barrier: the reward's default.
@@ -79,7 +80,7 @@ def load_scenario(name: str) -> Scenario:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Carry:
-    """What the grid remembers between control steps.
+    """The state between control steps.
 
     Attributes:
       start_row: [] int32, data row of the episode's row 0.
@@ -112,7 +113,7 @@ class VoltageControl:
     Args:
       case: "case33", "case141", or a Scenario of your own.
       data: "simbench" (measured profiles in the package), "synthetic" or "synthetic:SEED", a folder with MAPDN's three
-        csv files, an npz of `grid_data.save_profiles`, or Profiles.
+        csv files, an npz of `profiles.save_profiles`, or Profiles.
       noise: add MAPDN's one-sided noise to every data row.
       barrier: what voltages cost in the reward: l1, l2, bowl, courant_beltrami or bump; the scenario's own where None.
       reward: `mapdn`, or `loss_only` which leaves voltages to the cost.
@@ -241,7 +242,7 @@ class VoltageControl:
             row, next_key = self._load_row(start_row + self._first_row, carry_key)
             share = jax.random.uniform(q_key, (self.num_agents,), self._dtype, -1.0, 1.0)
             q = share * self.scenario.action_scale * self.q_limit(row)
-            return self._first(start_row, q, row, next_key)[0]
+            return self._solve_first(start_row, q, row, next_key)
 
         def unsolved(c: tuple[jax.Array, Carry]) -> jax.Array:
             return (c[0] < MAX_RESETS) & ~jnp.isfinite(c[1].line_loss_mw)
@@ -264,7 +265,7 @@ class VoltageControl:
             va_rad=flow.va_rad,
             line_loss_mw=flow.line_loss_mw,
         )
-        # Without a solution the grid stays in the state it was in, and is judged by it.
+        # Without a solution the grid stays in its last state, which reward and metrics then describe.
         ok = flow.converged
         solved = dataclasses.replace(
             solved, **{k: jnp.where(ok, getattr(solved, k), getattr(carry, k)) for k in _SOLVED_FIELDS}
@@ -290,17 +291,17 @@ class VoltageControl:
         q = jnp.asarray(q, self._dtype)
         unknown = [name for name in rest if name not in Carry.__dataclass_fields__]
         if unknown:
-            raise TaskError(f"restore knows no '{unknown[0]}'; known: {', '.join(Carry.__dataclass_fields__)}")
+            raise TaskError(f"restore takes no '{unknown[0]}'; known: {', '.join(Carry.__dataclass_fields__)}")
         if rest:
             key = jax.random.key(0) if key is None else key
-            first, _ = self._first(start_row, q, self._data_row(start_row + self._first_row), key)
+            first = self._solve_first(start_row, q, self._data_row(start_row + self._first_row), key)
             given = {k: jnp.asarray(v, getattr(first, k).dtype) for k, v in rest.items() if v is not None}
             return self._observe(dataclasses.replace(first, **given), push="frames" not in given)
         if key is None:
             row, key = self._data_row(start_row + self._first_row), jax.random.key(0)
         else:
             row, key = self._load_row(start_row + self._first_row, key)
-        return self._observe(self._first(start_row, q, row, key)[0])
+        return self._observe(self._solve_first(start_row, q, row, key))
 
     def raw(self, state: State) -> dict[str, Any]:
         """What `restore` takes."""
@@ -343,7 +344,7 @@ class VoltageControl:
         return action * self.scenario.action_scale * self.q_limit(row)
 
     def flow(self, state: State, action: jax.Array) -> PowerFlow:
-        """The power flow that `step(state, action)` would judge, differentiable in `action`."""
+        """The power flow that `step(state, action)` solves, differentiable in `action`."""
         return self._solve(state.carry.row, self._reactive(state.carry.row, action))[0]
 
     def _solve(self, row: jax.Array, q: jax.Array) -> tuple[PowerFlow, jax.Array, jax.Array]:
@@ -356,7 +357,7 @@ class VoltageControl:
         slack = network.slack
         return flow, p_bus.at[slack].set(-flow.slack_mw), q_bus.at[slack].set(-flow.slack_mvar)
 
-    def _first(self, start_row: jax.Array, q: jax.Array, row: jax.Array, key: jax.Array) -> tuple[Carry, PowerFlow]:
+    def _solve_first(self, start_row: jax.Array, q: jax.Array, row: jax.Array, key: jax.Array) -> Carry:
         """The carry after a reset: `row` solved with `q`, and about to be used again."""
         flow, p_bus, q_bus = self._solve(row, q)
         if not self._first_row:  # plain timing: the next flow is already the next row's
@@ -365,10 +366,9 @@ class VoltageControl:
         if self._history > 1:
             frames = jnp.zeros((self._history, *self._seen.shape), self._dtype)
         steps = jnp.asarray(1 if self._first_row else 2, jnp.int32)
-        carry = Carry(start_row, steps, key, row, q, p_bus, q_bus, flow.vm_pu, flow.va_rad, flow.line_loss_mw, frames)
-        return carry, flow
+        return Carry(start_row, steps, key, row, q, p_bus, q_bus, flow.vm_pu, flow.va_rad, flow.line_loss_mw, frames)
 
-    # What the outside sees
+    # Observations, reward and cost
 
     def _observe(
         self,
@@ -401,7 +401,7 @@ class VoltageControl:
         pv_at, q_at = _sum_at(pv, self._pvs_at), _sum_at(carry.q, self._pvs_at)
         degrees = jnp.rad2deg(carry.va_rad)
         zero = jnp.zeros(1, self._dtype)
-        # An agent is shown its region's demand: PVs added back, the active power that of the wrong row (MAPDN's quirk).
+        # An agent observes its region's demand: PVs added back, the active power that of the wrong row (MAPDN's quirk).
         local = [carry.p_bus + pv_at, carry.q_bus + q_at, pv, carry.q, carry.vm_pu, carry.va_rad, zero]
         whole = [carry.p_bus, carry.q_bus, pv, carry.q, carry.vm_pu, degrees]
         return jnp.concatenate(local)[self._seen], jnp.concatenate(whole)[self._stated]

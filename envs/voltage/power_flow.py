@@ -118,7 +118,7 @@ def solve(
 
     Batches by `jax.vmap`; runs in the precision of its inputs. The slack's own entry is ignored. Gradients (forward and
     reverse) come from the implicit function theorem, not from the iterations. A state without solution, and one with
-    power at a bus that `network` was told has none, comes back with `converged` False and nan everywhere.
+    power at a bus that is not one of its injection buses, comes back with `converged` False and nan everywhere.
 
     Args:
       tolerance: p.u.; the dtype's entry in TOLERANCE where None.
@@ -165,7 +165,7 @@ def _voltage_deviation(
     def error(x: jax.Array) -> jax.Array:
         return _dot(_current(net.no_load + x, power), net.impedance) - x
 
-    return jax.lax.custom_root(error, jnp.zeros_like(power), find, solve_linear, has_aux=True)  # type: ignore[return-value] (its stubs know no aux)
+    return jax.lax.custom_root(error, jnp.zeros_like(power), find, solve_linear, has_aux=True)  # type: ignore[return-value] (its stubs lack aux)
 
 
 @functools.cache
@@ -364,7 +364,7 @@ def _sum(terms: Sequence[jax.Array]) -> jax.Array:
 
 
 def _readout(net: Network, power: jax.Array, x: jax.Array) -> dict[str, jax.Array]:
-    """Everything a PowerFlow tells, from the deviations `x` [2m] of the injection buses."""
+    """The fields of a PowerFlow, from the deviations `x` [2m] of the injection buses."""
     n, m = net.n_bus, power.shape[0] // 2
     current = _current(net.no_load + x, power)
     v = _dot(current, net.voltage) + net.voltage_0
@@ -437,7 +437,7 @@ def load_network(name: str, inject: Sequence[int] | None = None) -> Network:
 
 
 def load_table(name: str) -> dict[str, np.ndarray]:
-    """The facts of a shipped network, as envs/data/README.md lists them."""
+    """The facts of a shipped network, as data/README.md lists them."""
     with np.load(DATA / f"grid_{one_of('network', name, NETWORKS)}.npz") as file:
         return dict(file)
 

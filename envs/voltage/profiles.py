@@ -178,7 +178,7 @@ def _times(path: Path, stamps: np.ndarray) -> np.ndarray:
     try:
         return stamps.astype("datetime64[s]")
     except ValueError:
-        pass  # not ISO 8601; pandas knows more spellings
+        pass  # not ISO 8601; pandas reads more formats
     try:
         import pandas
 
@@ -288,7 +288,7 @@ def _on_network(
 
 
 def synthetic_profiles(name: str, table: dict[str, np.ndarray], seed: int = 0, days: int = 366) -> Profiles:
-    """Profiles out of nothing but a seed: the same numbers on every machine.
+    """Profiles drawn from a seed: the same numbers on every machine.
 
     Sun: the clear-sky curve of 50 degrees north times a cloudiness that changes from day to day and within the day, one
     per region with a part in common. Loads: households, shops or industry by the hour and the weekday, heavier in

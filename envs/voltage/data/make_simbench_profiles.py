@@ -1,6 +1,6 @@
 """Makes simbench_profiles.npy.xz from the profiles in the package `simbench` (ODbL 1.0; see NOTICE-simbench.md).
 
-  pip install --no-deps simbench==1.6.3 && python envs/data/make_simbench_profiles.py
+  pip install --no-deps simbench==1.6.3 && python envs/voltage/data/make_simbench_profiles.py
 
 Eight measured PV plants and eighteen consumers of the year 2016 in 15-minute steps, each scaled to a maximum of 1 and
 rounded to 16 bits.

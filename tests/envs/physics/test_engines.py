@@ -17,14 +17,17 @@ import pytest
 from envs import physics
 from envs.ant import corridor
 from envs.errors import TaskError
-from envs.physics import c_engine, contract, mjx_patches, warp_engine
+from envs.physics import contract, mjx_patches, thread_team, warp_engine
 from places import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
+PLAIN = {"torso": ("xpos", 1), "motors": ("qfrc_actuator", slice(6, 14, 2))}
+# The C engine steps on threads of Python where a readout needs forces after constraints, else on a native batch.
+both = pytest.mark.parametrize("readout", [READOUT, PLAIN], ids=["threads", "batch"])
 
 
-def engine(**options):
-    return physics.make_engine(corridor.model(), substeps=5, readout=READOUT, **{"physics": "mujoco", **options})
+def engine(readout=READOUT, **options):
+    return physics.make_engine(corridor.model(), substeps=5, readout=readout, **{"physics": "mujoco", **options})
 
 
 def starts(count: int, seed: int = 0):
@@ -50,13 +53,14 @@ def run(script: str, timeout: float = 180.0) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
 
 
-def test_numbers_do_not_depend_on_threads_order_or_neighbours():
+@both
+def test_numbers_do_not_depend_on_threads_order_or_neighbours(readout):
     state, ctrl = starts(37)
-    lone = jax.jit(jax.vmap(engine(threads=1).step))(state, ctrl)
+    lone = jax.jit(jax.vmap(engine(readout, threads=1).step))(state, ctrl)
     for threads in (2, 5):
-        assert_same(lone, jax.jit(jax.vmap(engine(threads=threads).step))(state, ctrl))
+        assert_same(lone, jax.jit(jax.vmap(engine(readout, threads=threads).step))(state, ctrl))
     back = jax.tree.map(lambda x: x[::-1], (state, ctrl))
-    assert_same(lone, jax.tree.map(lambda x: x[::-1], jax.jit(jax.vmap(engine(threads=2).step))(*back)))
+    assert_same(lone, jax.tree.map(lambda x: x[::-1], jax.jit(jax.vmap(engine(readout, threads=2).step))(*back)))
 
 
 def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
@@ -71,9 +75,10 @@ def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
     assert_same(step(*first), jax.tree.map(lambda x: x[0], flat))
 
 
-def test_c_engine_is_a_plain_loop_over_mujoco():
+@both
+def test_c_engine_is_a_plain_loop_over_mujoco(readout):
     state, ctrl = starts(4)
-    after, out = jax.vmap(engine().step)(state, ctrl)
+    after, out = jax.vmap(engine(readout).step)(state, ctrl)
     model = corridor.model()
     data = mujoco.MjData(model)
     for i in range(4):
@@ -83,14 +88,15 @@ def test_c_engine_is_a_plain_loop_over_mujoco():
         mujoco.mj_rnePostConstraint(model, data)
         np.testing.assert_array_equal(after.qpos[i], data.qpos.astype(np.float32))
         np.testing.assert_array_equal(after.warmstart[i], data.qacc_warmstart.astype(np.float32))
-        np.testing.assert_array_equal(out["torso"][i], data.xpos[1].astype(np.float32))
-        np.testing.assert_array_equal(out["forces"][i], data.cfrc_ext.astype(np.float32))
+        for name, (field, index) in readout.items():
+            np.testing.assert_array_equal(out[name][i], getattr(data, field)[index].astype(np.float32))
 
 
-def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(tmp_path, monkeypatch):
+@both
+def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(readout, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     state, ctrl = starts(8)
-    step = jax.jit(jax.vmap(engine(threads=1).step))
+    step = jax.jit(jax.vmap(engine(readout, threads=1).step))
     healthy = step(state, ctrl)
     broken = physics.PhysicsState(
         state.qpos.at[2, 4].set(jnp.nan), state.qvel.at[4].set(1e9).at[5, 0].set(3e38), state.warmstart
@@ -118,9 +124,10 @@ def test_large_batches_in_long_programs_do_not_deadlock():
     assert np.isfinite(jax.block_until_ready(roll(state)).qpos).all()
 
 
-def test_two_programs_at_once_share_the_threads():
+@both
+def test_two_programs_at_once_share_the_threads(readout):
     state, ctrl = starts(24)
-    step = jax.jit(jax.vmap(engine(threads=3).step))
+    step = jax.jit(jax.vmap(engine(readout, threads=3).step))
     alone = step(state, ctrl)
     results = []
     threads = [threading.Thread(target=lambda: results.append(step(state, ctrl))) for _ in range(4)]
@@ -134,7 +141,7 @@ def test_two_programs_at_once_share_the_threads():
 
 
 def test_team_does_each_piece_once_and_leaves_nobody_behind():
-    team = c_engine._Team()
+    team = thread_team._Team()
     for threads in (1, 2, 5):
         queue, taken, at_work = iter(range(50)), [], []
 
@@ -151,7 +158,7 @@ def test_team_does_each_piece_once_and_leaves_nobody_behind():
 
 @pytest.mark.parametrize("guilty", ["the caller", "a helper"])
 def test_team_passes_errors_on_and_stops(guilty):
-    team, queue, caller, taken = c_engine._Team(), iter(range(1000)), threading.get_ident(), []
+    team, queue, caller, taken = thread_team._Team(), iter(range(1000)), threading.get_ident(), []
 
     def work():
         for piece in queue:
@@ -185,36 +192,45 @@ import os, signal, sys, threading, time
 import jax, jax.numpy as jnp, envs
 env = envs.make("ant_2x4", physics="mujoco", threads=2)
 state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))
-zero = jnp.zeros((16, 2, 4))
+zero = jnp.zeros((16, *env.spec.action_mask.shape))
 roll = jax.jit(lambda s, n: jax.lax.fori_loop(0, n, lambda _, s: jax.vmap(env.step)(s, zero), s))
 jax.block_until_ready(roll(state, 2))
 """
 
 
-def test_leaves_cleanly_while_a_program_runs():
-    done = run(ROLL + "later = roll(state, 100000)\nprint('leaving')\n")
+@pytest.mark.parametrize("task", ["ant_2x4", "hand_over_2x6"])
+def test_leaves_cleanly_while_a_program_runs(task):
+    done = run(ROLL.replace("ant_2x4", task) + "later = roll(state, 100000)\nprint('leaving')\n")
     assert done.returncode == 0 and "leaving" in done.stdout, done.stderr
 
 
 @pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork here")
 def test_forked_child_has_its_own_threads():
-    done = run(
-        ROLL
-        + textwrap.dedent("""
+    done = run("""
+        import gc, os, sys
         import numpy as np
-        rows = np.asarray(jnp.concatenate([state.carry.physics.qpos, jnp.zeros((16, 36))], axis=1))
+        from envs import physics
+        from envs.ant import corridor
+        readouts = {"forces": ("cfrc_ext", slice(None))}, {"torso": ("xpos", 1)}
+        options = dict(substeps=5, physics="mujoco", threads=2)
+        engines = [physics.make_engine(corridor.model(), readout=readout, **options) for readout in readouts]
+        rows = np.tile(np.concatenate([corridor.model().qpos0, np.zeros(36)]), (16, 1)).astype(np.float32)
         def advance():
-            out = np.zeros((16, env._engine._width), np.float32)
-            env._engine._advance(rows, out)
-            return out
+            out = [np.zeros((16, engine._width), np.float32) for engine in engines]
+            for engine, result in zip(engines, out):
+                engine._advance(rows, result)
+            return np.concatenate(out, axis=1)
         ours = advance()
         child = os.fork()
         if child == 0:
-            os._exit(0 if np.array_equal(advance(), ours) else 1)
+            same = np.array_equal(advance(), ours)
+            engines.clear()
+            gc.collect()  # frees what the child inherited
+            os._exit(0 if same else 1)
         assert os.waitpid(child, 0)[1] == 0
+        assert np.array_equal(advance(), ours)
         print("ok")
     """)
-    )
     assert done.stdout.strip().endswith("ok"), done.stderr
 
 

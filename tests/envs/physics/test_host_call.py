@@ -128,7 +128,7 @@ def test_tracebacks_are_printed_for_mistakes_only(capfd):
         assert ("Traceback" in capfd.readouterr().err) is printed
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # ctypes prints what struck the porch
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # ctypes prints what struck `entry`
 def test_ctrl_c_on_the_way_in_is_an_error():
     """A signal that waits when XLA calls strikes at the first bytecode, which is before any `try` of ours."""
     host_call.register(sums)
