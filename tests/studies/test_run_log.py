@@ -97,7 +97,7 @@ def test_what_is_no_run_gets_one_sentence(command: str, tmp_path: pathlib.Path, 
     monkeypatch.chdir(tmp_path)
     assert "none is not a run folder: there is no such folder" in cli(command, "none")[2]
     assert ". holds no run: no folder in it has a config.toml and a metrics.jsonl" in cli(command, ".")[2]
-    assert "not the pretrained policy 'hub:lane/f4sg'" in cli(command, "hub:lane/f4sg")[2]
+    assert "hub:lane/f4sg is a pretrained policy, which has no metrics" in cli(command, "hub:lane/f4sg")[2]
     written(tmp_path / "begun", [])
     assert "begun has no metrics yet: its metrics.jsonl is empty" in cli(command, "begun")[2]
     (written(tmp_path / "latin", [row(10, 0, 1.0)]) / "config.toml").write_bytes(b'task = "\xe9"')

@@ -13,6 +13,7 @@ import sys
 import pytest
 
 from pmt_jax import load_config, make_setup
+from pmt_jax.config.settings import to_toml
 from pmt_jax.errors import UsageError
 from pmt_jax.training import claims, run_folder
 
@@ -122,7 +123,9 @@ def test_a_sweep_has_its_folder_to_itself(tmp_path: pathlib.Path, cli):
     begun = tmp_path / ".group-1" / "run"
     with claims.claim(begun):
         (tmp_path / ".group-1" / "points").mkdir()
-        (tmp_path / ".group-1" / "points" / "clip=0.1.toml").write_text('task = "lane"\nclip = 0.1\n')
+        (tmp_path / ".group-1" / "points" / "clip=0.1.toml").write_text(
+            to_toml(load_config("lane", "mappo_l", clip=0.1))
+        )
         code, _, err = cli("sweep", "lane", "--set", "clip=0.1", "--out", tmp_path, "--method", "mappo_l")
         assert code == 2 and f"{begun} is in use" in err
     assert not (tmp_path / claims.NAME).exists()
