@@ -20,10 +20,11 @@ KINDS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT, "closed p
 
 SAVES_EVERY_ROW = """
 import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where tests run in the background
 from pmt_jax.cli import main
 from pmt_jax.training import trainer
 trainer.CHECKPOINT_SECONDS = 0.0
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(main(sys.argv[1:]))
 """
 

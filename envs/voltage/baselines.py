@@ -95,7 +95,7 @@ def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: 
             action, moments = c
             slope = jnp.nan_to_num(gradient(action, state))  # nan where the flow has no solution: stay
             step, moments = adam.update(slope, moments)
-            return jnp.clip(action + step, -1.0, 1.0), moments
+            return jnp.clip(action + jnp.asarray(step), -1.0, 1.0), moments
 
         start = jnp.clip(q_to_action(env, state, state.carry.q), -1.0, 1.0)
         return jax.lax.fori_loop(0, iterations, descend, (start, adam.init(start)))[0]

@@ -58,7 +58,7 @@ def evaluate(
         if count > 1
         else [metrics["true_episode_cost"] * felt.cost_seen]
     )
-    within = jnp.all(jnp.stack(costs, axis=-1) <= felt.cost_limit, axis=-1)
+    within = jnp.all(jnp.stack(costs, axis=-1) <= jnp.asarray(felt.cost_limit), axis=-1)
     return metrics | {"within_limit": within.astype(costs[0].dtype)}
 
 

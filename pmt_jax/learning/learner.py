@@ -76,7 +76,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
             else None
         ),
         multiplier=jnp.full(heads, hyper.lambda_init * constrained),
-        episode_cost=jnp.full(heads, hyper.cost_limit),
+        episode_cost=jnp.full(heads, jnp.asarray(hyper.cost_limit)),
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
         rollout=rollout.start(setup.vector, tagged[Tag.ENV]),
@@ -116,7 +116,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     # 5 Coping response: every agent's policy, and its multipliers.
     rows = policy_rows(setup, hyper, state, batch, advantage, cost_advantage, log_weight)
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
-    cost_excess = lagrangian.cost_excess(episode_cost, hyper.cost_limit, setup.vector.horizon)
+    cost_excess = lagrangian.cost_excess(episode_cost, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
     actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
 
     state = dataclasses.replace(

@@ -113,7 +113,7 @@ class Networks:
     def awaken_fear(self, params: Params, cost_rate: jax.Array) -> Params:
         """Starts fear at the observed `cost_rate` [N, K] where it has begun at nan; other weights stay as they are."""
         rate = jnp.clip(cost_rate, 1e-3, 1 - 1e-3)
-        bias = params["params"][self._fear_head]["bias"].reshape(rate.shape)
+        bias: jax.Array = params["params"][self._fear_head]["bias"].reshape(rate.shape)
         return self._with_fear_bias(params, jnp.where(jnp.isnan(bias), jnp.log(rate / (1 - rate)), bias))
 
     @property

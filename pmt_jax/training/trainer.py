@@ -8,7 +8,6 @@ import math
 import os
 import pathlib
 import shlex
-import signal
 import time
 from collections.abc import Sequence
 
@@ -83,9 +82,11 @@ def train(
             trainer.train(interrupts)
             stack.close()
         except OSError as error:
+            with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
+                stack.close()
             say(trainer.write_failure(error))
             return 1
-        return trainer.finish(interrupts)
+        return trainer.finish()
 
 
 def _claim_folder(
@@ -138,15 +139,15 @@ class Trainer:
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
         self.total = self.config.num_updates * self.config.batch_size
-        self._overflow = False
+        self._signal = 0
         self._loggers: list[Logger] = []
 
     def open(
         self,
         stack: contextlib.ExitStack,
         resume: bool,
-        loggers: Sequence[str] = (),
-        profile: pathlib.Path | None = None,
+        loggers: Sequence[str],
+        profile: pathlib.Path | None,
     ) -> None:
         """Opens what is written to until `stack` closes, and continues from the newest checkpoint if `resume`."""
         if not resume:
@@ -178,7 +179,7 @@ class Trainer:
         self.best = dataclasses.replace(best, state=sharding.place(self.setup.mesh, best.state))
         reasons = {row["seed"] - self.config.seed: row.get("broken") for row in rows}
         for i, update in enumerate(np.asarray(sharding.gather(self.state.update))):
-            if update * self.config.batch_size < self.step:
+            if int(update) * self.config.batch_size < self.step:  # beyond int32
                 self.broken[i] = reasons.get(i) or f"seed {self.config.seed + i} broke before step {self.step:,}"
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -207,7 +208,9 @@ class Trainer:
         return len(self.broken) == self.config.seeds
 
     def _agree_to_stop(self, interrupts: Interrupts) -> bool:
-        return bool(processes.agree(interrupts.received[0] if interrupts.received else 0))
+        """Whether a signal has reached any of the processes."""
+        self._signal = processes.agree(interrupts.received[0] if interrupts.received else 0)
+        return self._signal > 0
 
     def _train_chunk(self) -> list[Row]:
         """Trains all seeds for `log_interval` updates; those that break stay where they were."""
@@ -230,7 +233,6 @@ class Trainer:
 
     def _find_broken(self, rows: list[Row], finite: np.ndarray) -> None:
         overflow = health.overflow(self.setup, [row for i, row in enumerate(rows) if i not in self.broken])
-        self._overflow |= overflow is not None
         for i, row in enumerate(rows):
             reason = overflow or health.diagnose(self.setup, i, row, bool(finite[i]))
             if reason and i not in self.broken:
@@ -277,16 +279,18 @@ class Trainer:
     # -----------------------------------------------------------------------------------------------------------------
     # The end
 
-    def finish(self, interrupts: Interrupts) -> int:
+    def finish(self) -> int:
         """Prints how training ended and what to do next; returns the exit code."""
         self._list_broken()
         if self.step < self.total and not self.all_broken:
             self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self._command}")
-            return 128 + (interrupts.received[0] if interrupts.received else signal.SIGINT)
+            return 128 + self._signal
         if not self.all_broken:
             next_step = "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.out)])}"
             self.say(f"done: {self.step:,} steps in {duration(self.seconds)}{next_step}")
-        return int(self._overflow or (bool(self.broken) and not self.setup.trials))
+        # A trial that diverges is a result of its sweep, lost contacts are not.
+        overflow = any(health.NO_ROOM in reason for reason in self.broken.values())
+        return int(overflow or (bool(self.broken) and not self.setup.trials))
 
     def _list_broken(self) -> None:
         """Prints which seeds broke and why, the first few in full."""

@@ -18,7 +18,7 @@ import pytest
 from pmt_jax import load_policy
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
-from pmt_jax.training import checkpoint, loggers, trainer
+from pmt_jax.training import checkpoint, loggers, run_folder, trainer
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
 
 DIES = """
@@ -86,6 +86,26 @@ def test_a_full_disk_stops_the_run_and_nothing_saved_is_lost(whole: pathlib.Path
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out, "--resume")
     assert code == 0 and int(re.findall(r"resuming after ([\d,]+) steps", text)[0]) >= 200
     assert_same_run(out, whole)
+
+
+def test_rows_that_cannot_be_written_stop_the_run(tmp_path: pathlib.Path, cli, monkeypatch):
+    monkeypatch.setattr(loggers.Jsonl, "__init__", lambda self, path: setattr(self, "_file", open("/dev/full", "w")))
+    out = tmp_path / "run"
+    code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
+    assert code == 1 and not err and f"stopped: cannot write into {out}: No space left on device" in text
+
+
+def test_a_run_of_more_steps_than_fit_into_int32_is_resumed(copy: pathlib.Path, cli):
+    step, updates = 3_000_000_000, 30_000_000
+    _, _, saved = run_folder.load_saved(copy)
+    for state in (saved["last"], saved["best"].state):
+        object.__setattr__(state, "update", jnp.full_like(state.update, updates))
+    checkpoints = checkpoint.Checkpoints(copy)
+    checkpoints.save(step, saved)
+    checkpoints.close()
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", step + 400, "--out", copy, "--resume")
+    assert code == 0 and "resuming after 3,000,000,000 steps" in text and "done: 3,000,000,400 steps" in text
+    assert [row["broken"] for row in rows(copy)[-4:]] == [None] * 4
 
 
 def damage(step: pathlib.Path) -> None:
