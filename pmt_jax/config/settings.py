@@ -93,6 +93,12 @@ class Hyper:
     lambda_lr: float = constraint(
         0.1, "step of the multiplier per update, for an excess in cost per step", NOT_NEGATIVE
     )
+    lambda_kp: float = constraint(
+        0.0, "with lambda_rule = pid, added to the multiplier for an excess of 1 in cost per step", NOT_NEGATIVE
+    )
+    lambda_kd: float = constraint(
+        0.0, "with lambda_rule = pid, added for an excess that has risen by 1 since the last update", NOT_NEGATIVE
+    )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
     surrogate_weight: float = constraint(
         1.0,
@@ -172,6 +178,11 @@ class Config(Hyper):
         "episode",
         "estimate of the episode cost for the multiplier: mean of the episodes that finished in this update, the cost "
         "rate of this update's steps times the horizon, or the same of the cost critic's values",
+    )
+    lambda_rule: Literal["integral", "pid"] = constraint(
+        "integral",
+        "the multiplier sums up excesses, each times lambda_lr, or lambda_kp and lambda_kd add what the excess is now "
+        "and how it rises (PID-Lagrangian)",
     )
     cost_advantage: Literal["std", "center"] = constraint(
         "std", "cost advantages in the policy's loss are standardised (with a floor) or only centred"

@@ -14,7 +14,7 @@ import scipy.special
 
 from .. import tasks
 from . import sharding
-from .rollout import Feel
+from .rollout import Feel, is_within
 from .setup import Setup
 from .types import ActingState, Hyper, Metrics, Tag
 
@@ -53,13 +53,10 @@ def evaluate(
 
     metrics = play(setup.vector.env, act, episodes, feel)
     count = setup.vector.spec.num_costs
-    costs = (
-        [metrics[f"episode_cost/{k}"] for k in range(count)]
-        if count > 1
-        else [metrics["true_episode_cost"] * felt.cost_seen]
-    )
-    within = jnp.all(jnp.stack(costs, axis=-1) <= jnp.asarray(felt.cost_limit), axis=-1)
-    return metrics | {"within_limit": within.astype(costs[0].dtype)}
+    names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
+    costs = jnp.stack([metrics[name] for name in names], axis=-1)
+    within = is_within(costs, metrics["true_episode_cost"][:, None], felt)
+    return metrics | {"within_limit": within.astype(costs.dtype)}
 
 
 def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost) -> Metrics:

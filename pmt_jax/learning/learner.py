@@ -114,9 +114,11 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     )
 
     # 5 Coping response: every agent's policy, and its multipliers.
-    rows = policy_rows(setup, hyper, state, batch, advantage, cost_advantage, log_weight)
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
-    cost_excess = lagrangian.cost_excess(episode_cost, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
+    limit = jnp.asarray(hyper.cost_limit)
+    cost_excess = lagrangian.cost_excess(episode_cost, limit, setup.vector.horizon)
+    weigh = functools.partial(_weight_of_cost, setup, hyper, state, cost_excess)
+    rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
 
     state = dataclasses.replace(
@@ -132,8 +134,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     )
     return state, {
         **rollout.summary(batch),
-        "lambda": multiplier.mean(),
+        "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper)),
+        "lambda": weigh(multiplier).mean(),
         "cost_excess": cost_excess.mean(),
+        "cost_beyond": jnp.maximum(episode_cost - limit, 0.0).sum(-1).mean(),
         **{f"critic/{k}": x for k, x in critic_metrics.items()},
         **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
         **{f"actor/{k}": x for k, x in actor_metrics.items()},
@@ -182,6 +186,16 @@ def _episode_cost(setup: Setup, hyper: Hyper, state: LearnerState, batch: Batch,
     if setup.config.cost_estimate == "critic":
         return (1 - hyper.gamma) * horizon * cost_value.mean((0, 1))
     return rollout.episode_cost_estimate(batch, state.episode_cost, setup.config.cost_estimate, horizon)
+
+
+def _weight_of_cost(
+    setup: Setup, hyper: Hyper, state: LearnerState, cost_excess: jax.Array, multiplier: jax.Array
+) -> jax.Array:
+    """What the policies weigh costs with [N, K]: the multiplier that a state carries, or the PID's sum with it."""
+    if setup.config.lambda_rule == "integral" or setup.method.constraint != "lagrangian":
+        return multiplier
+    previous = lagrangian.cost_excess(state.episode_cost, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
+    return lagrangian.pid(multiplier, cost_excess, previous, hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max)
 
 
 ValueFn = Callable[[Params, jax.Array], jax.Array]

@@ -43,7 +43,7 @@ def update_policies(
 def policy_rows(
     setup: Setup,
     hyper: Hyper,
-    state: LearnerState,
+    multiplier: jax.Array,
     batch: Batch,
     advantage: jax.Array,
     cost_advantage: jax.Array,
@@ -52,14 +52,14 @@ def policy_rows(
     """The batch as every agent's policy sees it, leaves [N, R, ...].
 
     Args:
-      advantage: [T, B]; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
+      multiplier: [N, K]; advantage: [T, B]; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
     scaled_cost = scaled if setup.config.cost_advantage == "std" else centred
     if setup.config.regret_response == "advantage":
         scaled_cost, log_weight = scaled_cost * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
-    hybrid = hybrid_advantage(advantage[..., None], scaled_cost, state.multiplier)
+    hybrid = hybrid_advantage(advantage[..., None], scaled_cost, multiplier)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
     rows = PolicyRows(

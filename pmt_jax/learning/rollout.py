@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ..tasks import Outcome, State, VectorEnv
 from . import sharding
 from .maths import distributions
-from .types import Batch, RolloutState
+from .types import Batch, Hyper, RolloutState
 
 Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
 Normalise = Callable[[jax.Array], jax.Array]
@@ -111,6 +111,17 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
     """Mean of `x` [T, B, ...] over the steps that ended an episode; nan where none did."""
     done = batch.done.reshape(batch.done.shape + (1,) * (x.ndim - 2))
     return jnp.sum(x * done, (0, 1)) / done.sum()  # 0 / 0 is nan
+
+
+def within_limit(batch: Batch, hyper: Hyper) -> jax.Array:
+    """Whether an episode's cost up to a step is within its limit, [T, B] bool."""
+    return is_within(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper)
+
+
+def is_within(felt: jax.Array, true: jax.Array, hyper: Hyper) -> jax.Array:
+    """Whether episode costs [..., K] are within their limits, [...] bool: the true one, of several each felt one."""
+    cost = felt if felt.shape[-1] > 1 else true * hyper.cost_seen
+    return jnp.all(cost <= jnp.asarray(hyper.cost_limit), axis=-1)
 
 
 def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:

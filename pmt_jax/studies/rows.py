@@ -29,6 +29,7 @@ class Column(NamedTuple):
       metric: its name in metrics.jsonl.
       low, high: no value lies beyond; intervals are cut there.
       note: what it is, under the table.
+      throughout: whether a score is the mean over all of training, not over its last tenth.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Column(NamedTuple):
     low: float = -math.inf
     high: float = math.inf
     note: str = ""
+    throughout: bool = False
 
 
 COLUMNS = (
@@ -47,6 +49,13 @@ COLUMNS = (
     Column("true step cost", "true_step_cost", 0),
     Column(
         "episodes within", "within_limit", 0, 1, "episodes within: share of episodes whose cost is within the limit"
+    ),
+    Column(
+        "cost beyond",
+        "cost_beyond",
+        0,
+        note="cost beyond: an episode's cost beyond the limit, 0 within it, mean over all steps of training",
+        throughout=True,
     ),
 )
 
@@ -128,7 +137,7 @@ def _row(group: Group) -> Row:
     first, last = group.runs[0], group.runs[-1]
     if len({run.evaluated for run in group.runs}) > 1:
         raise UsageError(f"{first.folder} and {last.folder} cannot share a row: only one was evaluated in training")
-    scores = {column.name: group.final(column.metric) for column in columns([group.task])}
+    scores = {c.name: group.score(c.metric, c.throughout) for c in columns([group.task])}
     return Row(
         task=group.task,
         method=group.method,

@@ -78,6 +78,13 @@ class RunLog:
         mean = np.where(known, values, 0.0).sum(1) / np.maximum(known.sum(1), 1)
         return np.where(known.any(1) & ~np.isin(self.seeds, self.broken), mean, np.nan)
 
+    def throughout(self, name: str) -> np.ndarray | None:
+        """[S] means of a metric over all steps of training, nan for a seed that broke; None if unknown."""
+        if name not in self.metrics:
+            return None
+        mean = _averaged(self.metrics[name], [0])[:, 0]
+        return np.where(np.isin(self.seeds, self.broken), np.nan, mean)
+
     @property
     def excess(self) -> np.ndarray:
         """[S] how far each seed's cost at the end (see `final`) is beyond the limit; of several costs the worst.
@@ -295,9 +302,9 @@ class Group:
         """Of all runs."""
         return tuple(seed for run in self.runs for seed in run.seeds)
 
-    def final(self, name: str) -> np.ndarray | None:
-        """[S] a metric's means over the last tenth of each run's steps; None where a run does not know it."""
-        found = [run.final(name) for run in self.runs]
+    def score(self, name: str, throughout: bool = False) -> np.ndarray | None:
+        """[S] a metric's means over the last tenth of each run's steps, or all; None where a run does not know it."""
+        found = [run.throughout(name) if throughout else run.final(name) for run in self.runs]
         known = [x for x in found if x is not None]
         return np.concatenate(known) if len(known) == len(found) else None
 

@@ -26,6 +26,27 @@ def test_a_multiplier_that_acts_makes_a_difference():
         chex.assert_trees_all_equal(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
+def test_pid_without_its_gains_is_the_integral():
+    chex.assert_trees_all_equal(trained("mappo_l", lambda_rule="pid"), trained("mappo_l"))
+
+
+def test_pid_weighs_costs_by_three_terms():
+    """A proportional gain weighs costs as a larger multiplier does, from the first update on."""
+    pid, plain = program("mappo_l", lambda_rule="pid"), program("mappo_l")
+    start = plain.init(plain.setup.hyper, jax.random.key(0))
+    _, metrics = plain.step(plain.setup.hyper, start)
+    excess = metrics["cost_excess"]  # the same of both agents; the estimate before the first update is the limit
+    with_gains, shown = pid.step(pid.hyper(lambda_kp=0.5, lambda_kd=0.25), start)
+    larger, _ = plain.step(plain.setup.hyper, dataclasses.replace(start, multiplier=start.multiplier + 0.75 * excess))
+    chex.assert_trees_all_close(with_gains.actor.params, larger.actor.params, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(shown["lambda"], with_gains.multiplier.mean() + 0.75 * excess, rtol=1e-5)
+    _, later = pid.step(pid.hyper(lambda_kd=0.25), with_gains)
+    rise = max(float(later["cost_excess"] - excess), 0.0)
+    np.testing.assert_allclose(
+        later["lambda"], pid.step(pid.hyper(), with_gains)[0].multiplier.mean() + 0.25 * rise, rtol=1e-2
+    )
+
+
 def test_happo_and_mappo_are_the_same_with_one_agent():
     happo, mappo = (trained(method, env=(("num_agents", 1),))[0] for method in ("happo", "mappo"))
     chex.assert_trees_all_equal(weights(happo), weights(mappo))
@@ -88,7 +109,7 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
     rows = policy_update.policy_rows(
-        setup, hyper, state, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
+        setup, hyper, state.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
     cost_excess = jnp.asarray([[0.5], [0.25]])
     actor, multiplier, _ = policy_update._sequential(setup, hyper, state, rows, cost_excess, tagged)

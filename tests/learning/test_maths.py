@@ -158,6 +158,26 @@ def test_dual_update_is_projected():
     assert lagrangian.dual_update(jnp.asarray(19.9), -violation, jnp.asarray(0.0), 2.0, 20.0) == 20
 
 
+def test_pid_adds_what_the_excess_is_and_how_it_rises():
+    integral, risen, fallen = jnp.asarray(0.75), (jnp.asarray(0.5), 0.25), (jnp.asarray(-0.25), 0.5)
+    assert lagrangian.pid(integral, *risen, 0.0, 0.0, 20.0) == 0.75
+    assert lagrangian.pid(integral, *risen, 2.0, 0.0, 20.0) == 0.75 + 2 * 0.5
+    assert lagrangian.pid(integral, *risen, 0.0, 4.0, 20.0) == 0.75 + 4 * 0.25
+    assert lagrangian.pid(integral, *fallen, 2.0, 4.0, 20.0) == 0.75 - 2 * 0.25  # a cost that falls adds nothing
+    assert lagrangian.pid(integral, *fallen, 4.0, 0.0, 20.0) == 0
+    assert lagrangian.pid(integral, *risen, 99.0, 0.0, 20.0) == 20
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_pid_does_not_wind_up(sign: int):
+    """However long the excess lasted, one update of the other sign takes the multiplier off its bound."""
+    excess, integral = jnp.asarray(0.5 * sign), jnp.asarray(1.0)
+    for _ in range(1000):
+        integral = lagrangian.dual_update(integral, excess, jnp.asarray(0.0), 0.25, 2.0)
+    after = lagrangian.dual_update(integral, -excess, jnp.asarray(0.0), 0.25, 2.0)
+    assert lagrangian.pid(after, -excess, excess, 1.0, 0.0, 2.0) == (2 - 0.125 - 0.5 if sign > 0 else 0.125 + 0.5)
+
+
 def test_log_prob_and_entropy_agree_with_scipy():
     rng = np.random.default_rng(0)
     action, mean = rng.normal(size=(2, 5, 3))

@@ -14,7 +14,9 @@ import pytest
 import envs
 from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
+from pmt_jax.config.settings import Hyper
 from pmt_jax.learning import learner, rollout
+from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import LearnerState
 from small import SMALL, acted, program, trained, weights
 
@@ -184,6 +186,22 @@ def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
     np.testing.assert_array_equal(estimate, batch.episode_cost[3, 2])
 
 
+def test_share_of_episodes_within_and_cost_beyond_the_limit():
+    setup, _, batch = acted()
+    cost = np.asarray(batch.true_episode_cost[-1, :, :, 0]).mean(-1)  # all episodes end with the batch
+    for limit in np.median(cost), cost.max(), cost.min() - 1e-3:
+        share = rollout.finished_mean(batch, rollout.within_limit(batch, hyper_of(setup, limit)))
+        np.testing.assert_allclose(share, (cost <= np.float32(limit)).mean())
+    several = rollout.is_within(jnp.asarray([[1.0, 2.0], [3.0, 0.0]]), jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]))
+    assert several.tolist() == [True, False]
+    assert rollout.is_within(jnp.ones((1, 1)), jnp.ones((1, 1)), hyper_of(setup, 0.5, cost_seen=0.5)).all()
+    made = program("mappo_l")
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    for limit in 3.0, 30.0:
+        _, metrics = made.step(made.hyper(cost_limit=limit), start)
+        np.testing.assert_allclose(metrics["cost_beyond"], max(metrics["episode_cost"] - limit, 0.0), rtol=1e-5)
+
+
 def test_figures_of_episodes_count_finished_ones_only():
     """Episodes of 25 steps end in the third and the fifth rollout of 10 steps."""
     vector = envs.vector.VectorEnv(envs.make("lane"), 8)
@@ -200,6 +218,10 @@ def test_figures_of_episodes_count_finished_ones_only():
     np.testing.assert_array_equal(metrics["episodes"], [0, 0, 8, 0, 8])
     np.testing.assert_array_equal(np.isfinite(metrics["episode_reward"]), [False, False, True, False, True])
     np.testing.assert_array_equal(metrics["episode_length"][np.array([2, 4])], 25)
+
+
+def hyper_of(setup: Setup, limits: float | list[float], **changes: float) -> Hyper:
+    return dataclasses.replace(setup.hyper, cost_limit=jnp.asarray(limits), **changes)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

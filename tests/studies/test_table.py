@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from by_hand import made
+from by_hand import made, row, written
 from pmt_jax.studies import statistics
 from pmt_jax.studies.rows import Row
 
@@ -32,6 +32,20 @@ def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
     assert data["f4sg"]["better"]["more reward"]["probability"] == 7.5 / 12
     assert data["f4sg"]["better"]["less cost"]["probability"] == (3 * 3 + 2) / 12  # less cost is better
     assert data["mappo_l"]["better"] is None
+
+
+def test_a_table_says_how_the_limit_was_kept(tmp_path: pathlib.Path, cli):
+    """Shares of episodes at the end; the excess over all of training."""
+    lines = [
+        row(100 * step, seed, 1.0, episode_cost=0.5 + seed, within_limit=step / 20, cost_beyond=seed * (20.0 - step))
+        for step in range(1, 21)
+        for seed in (0, 1)
+    ]
+    written(tmp_path / "a", lines)
+    (data,) = json.loads(cli("table", tmp_path, "--format", "json")[1])["rows"]
+    assert data["episodes within"]["mean"] == pytest.approx((19 + 20) / 40)
+    assert data["cost beyond"]["mean"] == pytest.approx((0 + 9.5) / 2)
+    assert (data["within"], data["worst"]) == (0.5, 1.5)
 
 
 def test_a_table_says_who_left_the_corridor(tmp_path: pathlib.Path, cli):

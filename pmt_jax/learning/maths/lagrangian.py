@@ -1,4 +1,4 @@
-"""The Lagrangian multiplier: the excess of a cost over its limit, and the multiplier's step (Eq. 11, 16, 17)."""
+"""The Lagrangian multiplier: the excess of a cost over its limit, the multiplier's step (Eq. 11, 16, 17), and PID."""
 
 from __future__ import annotations
 
@@ -40,3 +40,23 @@ def dual_update(
       multiplier: [...], lambda; violation: S [...] and surrogate: I [...], both in cost per step.
     """
     return jnp.clip(multiplier + lambda_lr * (cost_excess + surrogate), 0.0, lambda_max)
+
+
+def pid(
+    integral: jax.Array,
+    cost_excess: jax.Array,
+    previous_excess: jax.Array,
+    lambda_kp: jax.Array | float,
+    lambda_kd: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """The multiplier of PID control: lambda = clip(I + kp S + kd max(S - S_prev, 0), 0, lambda_max).
+
+    I moves by `dual_update`, whose projection is the anti-windup: it never leaves the multiplier's own interval, so it
+    answers at once when the excess changes sign. A cost that falls adds nothing (Stooke et al., 2020, Algorithm 2).
+
+    Args:
+      integral: I [...]; cost_excess, previous_excess: S [...] of this update and of the last, in cost per step.
+    """
+    change = jnp.maximum(cost_excess - previous_excess, 0.0)
+    return jnp.clip(integral + lambda_kp * cost_excess + lambda_kd * change, 0.0, lambda_max)
