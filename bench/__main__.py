@@ -67,7 +67,9 @@ def _add_showing(commands: Any) -> None:
     stored.add_argument("folders", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
     published = command(commands, "publish", _publish, "make pretrained policies of runs, and tell their figures")
-    published.add_argument("folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders")
+    published.add_argument(
+        "folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders, or hub:NAME to measure it anew"
+    )
     published.add_argument("--episodes", type=whole(1), default=64, help="of the evaluations (default 64)")
 
 

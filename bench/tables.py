@@ -211,7 +211,7 @@ def hub(reports: Reports) -> str:
     rows, body = reports["hub"]["rows"], []
     for row in rows:
         reward, cost = (row["figures"][f"episode_{what}"] for what in ("reward", "cost"))
-        moved = reward[0] - row["unpacked"]["episode_reward"][0]
+        moved = row["packed"]["episode_reward"][0] - row["unpacked"]["episode_reward"][0]
         body.append(
             [
                 f"`{row['name']}`",

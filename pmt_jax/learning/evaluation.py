@@ -19,12 +19,19 @@ from .setup import Setup
 from .types import ActingState, Hyper, Metrics, Tag
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
+FRESH_KEY = EVALUATION_KEY + 1  # of starts by which no policy was chosen
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
 
 
 def evaluate(
-    setup: Setup, state: ActingState, episodes: int, *, deterministic: bool, hyper: Hyper | None = None
+    setup: Setup,
+    state: ActingState,
+    episodes: int,
+    *,
+    deterministic: bool,
+    fresh: bool = False,
+    hyper: Hyper | None = None,
 ) -> Metrics:
     """Runs one seed's policy for `episodes` whole episodes.
 
@@ -33,6 +40,7 @@ def evaluate(
       state: a learner state of one seed, or what of it acts.
       episodes: environments, one episode each.
       deterministic: take the mean action instead of a sample.
+      fresh: from starts, and with noise, other than those that training and `publish` choose by.
       hyper: says what of the costs is felt; the setup's own if None.
 
     Returns:
@@ -40,7 +48,7 @@ def evaluate(
       one) is within its limit.
     """
     felt = setup.hyper if hyper is None else hyper
-    key = jax.random.key(EVALUATION_KEY)
+    key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
 
     def act(env: tasks.State, t: jax.Array) -> jax.Array:
         mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, env.obs))
@@ -51,7 +59,7 @@ def evaluate(
         step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
         return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
 
-    metrics = play(setup.vector.env, act, episodes, feel)
+    metrics = play(setup.vector.env, act, episodes, feel, fresh)
     count = setup.vector.spec.num_costs
     names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
     costs = jnp.stack([metrics[name] for name in names], axis=-1)
@@ -59,11 +67,12 @@ def evaluate(
     return metrics | {"within_limit": within.astype(costs.dtype)}
 
 
-def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost) -> Metrics:
+def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost, fresh: bool = False) -> Metrics:
     """`episodes` whole episodes of any policy, from starts that are always the same.
 
     Args:
       feel: what of a step's cost the team notices; all of it by default.
+      fresh: as in `evaluate`.
 
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
@@ -96,7 +105,8 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
         sums = {name: sums[name] + alive * now[name] for name in sums}
         return (state, alive & ~(outcome.terminated | outcome.truncated), sums), None
 
-    start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))
+    key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
+    start = vector.reset(jax.random.fold_in(key, vector.horizon))
     names = [f"episode_cost/{k}" for k in several]
     names += ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
     names += ["true_episode_cost", "true_violation_rate"]

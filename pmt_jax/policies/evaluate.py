@@ -17,6 +17,7 @@ from ..training.compile import evaluate_seeds
 from ..training.health import NO_ROOM
 from ..training.metrics import seed_intervals
 from ..training.run_folder import MATMUL_PRECISION, Say
+from . import hub
 from .load import load_run
 
 
@@ -30,19 +31,28 @@ def evaluate_run(
 ) -> list[dict[str, Any]]:
     """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
 
+    A state that was chosen, a pretrained policy or `best`, is evaluated from other starts than it was chosen by.
+
     Args:
       out: the run folder, which is only read, or the name of a pretrained policy.
       deterministic: take mean actions instead of samples.
       which: `last` or `best`.
       physics: an engine other than the run's.
     """
-    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic)
+    chosen = which == "best" or hub.is_name(out)
+    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic, fresh=chosen)
 
 
-def evaluate_states(setup: Setup, state: ActingState, episodes: int, deterministic: bool) -> list[dict[str, Any]]:
-    """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts."""
+def evaluate_states(
+    setup: Setup, state: ActingState, episodes: int, deterministic: bool, fresh: bool
+) -> list[dict[str, Any]]:
+    """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts.
+
+    Args:
+      fresh: from starts other than those that training and `publish` choose by.
+    """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic))(state))
+    results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic, fresh))(state))
     if setup.overflow and np.any(results[setup.overflow] > 0):
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
     return [

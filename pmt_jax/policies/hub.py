@@ -83,14 +83,28 @@ def save(name: str, config: Config, state: ActingState, facts: dict[str, Any]) -
       UsageError: the file cannot be written.
     """
     settings = to_toml(config.replace(seeds=1, seed=facts["seed"], physics="auto"))
-    table = _narrowed(checkpoint.pack(state))
-    with writing(file_of(name)) as partial:
-        np.savez_compressed(partial, config=settings, about=json.dumps(facts), **table)  # pyright: ignore[reportArgumentType] (its stub)
+    _write(
+        name, _narrowed(checkpoint.pack(state)) | {"config": np.array(settings), "about": np.array(json.dumps(facts))}
+    )
+
+
+def tell(name: str, facts: dict[str, Any]) -> None:
+    """Makes `about` answer with other facts from now on.
+
+    Raises:
+      UsageError: there is no such policy, or its file cannot be written.
+    """
+    _write(name, _read(name) | {"about": np.array(json.dumps(facts))})
 
 
 def rounded(state: ActingState) -> ActingState:
     """What `load` gives back of a state that was saved."""
     return checkpoint.unpack(_widened(_narrowed(checkpoint.pack(state))), state)
+
+
+def _write(name: str, table: dict[str, np.ndarray]) -> None:
+    with writing(file_of(name)) as partial:
+        np.savez_compressed(partial, **table)  # pyright: ignore[reportArgumentType] (its stub)
 
 
 def _read(name: str) -> dict[str, np.ndarray]:

@@ -1,8 +1,8 @@
 """Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
 
-`python -m bench publish RUN...` does so in a checkout. All figures are means over the same whole episodes under mean
-actions. A policy is better by the rule that `best` checkpoints are kept by (docs/runs.md); for methods without a
-constraint reward alone counts.
+`python -m bench publish RUN...` does so in a checkout. All figures are means over whole episodes under mean actions;
+those that are told are from other starts than those by which the policy was chosen. A policy is better by the rule that
+`best` checkpoints are kept by (docs/runs.md); for methods without a constraint reward alone counts.
 """
 
 from __future__ import annotations
@@ -31,9 +31,14 @@ from .load import WHICH
 def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
     """Makes the best policy of a run the pretrained one of its task and method; returns what is known about it.
 
+    Args:
+      folder: the run; or the name of a pretrained policy, whose figures are measured anew.
+
     Raises:
       UsageError: no run to be loaded, or one of a task that is not the package's own.
     """
+    if hub.is_name(folder):
+        return _measure(str(folder), episodes)
     run, which, row, state = choose(folder, episodes)
     config = run.config
     if config.task not in tasks.names():
@@ -46,14 +51,22 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
         "which": which,
         "step": row["step"],
         "cost_limit": row["cost_limit"],
-        "episodes": episodes,
-        "engine": run.vector.env.engine,
-        "figures": figures(evaluate_states(run, packed, episodes, deterministic=True)[0]),
-        "unpacked": {name: figures(row)[name] for name in ("episode_reward", "episode_cost")},
+        "unpacked": _chosen_by(row),
+        "packed": _chosen_by(evaluate_states(run, packed, episodes, deterministic=True, fresh=False)[0]),
         "action_change": action_change(run, packed, state),
         "training": json.loads((folder / "versions.json").read_text()),
     }
-    hub.save(f"{hub.PREFIX}{config.task}/{config.method}", config, state, facts)
+    name = f"{hub.PREFIX}{config.task}/{config.method}"
+    hub.save(name, config, state, facts)
+    return _measure(name, episodes)
+
+
+def _measure(name: str, episodes: int) -> dict[str, Any]:
+    """Evaluates a pretrained policy from fresh starts; returns what is known about it now."""
+    run, state = hub.load(name)
+    (row,) = evaluate_states(run, state, episodes, deterministic=True, fresh=True)
+    facts = hub.about(name) | {"episodes": episodes, "engine": run.vector.env.engine, "figures": figures(row)}
+    hub.tell(name, facts)
     return facts
 
 
@@ -67,7 +80,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     states = [saved["last"], saved["best"].state]
     acting = [ActingState(TrainState(state.actor.params, None), state.obs_moments, state.update) for state in states]
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
-    rows = evaluate_states(run, both, episodes, deterministic=True)
+    rows = evaluate_states(run, both, episodes, deterministic=True, fresh=False)
     reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
     # A limit that training did not know does not count: MAPPO's best would be a policy that has hardly learned.
     limit = np.inf if run.method.constraint == "none" else run.cost_limit
@@ -85,6 +98,11 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
 def figures(row: dict[str, Any]) -> dict[str, list[float]]:
     """The means and half-widths of an evaluation's row."""
     return {name: [round(float(x), 6) for x in pair] for name, pair in row.items() if isinstance(pair, tuple)}
+
+
+def _chosen_by(row: dict[str, Any]) -> dict[str, list[float]]:
+    """The figures by which a policy is chosen."""
+    return {name: figures(row)[name] for name in ("episode_reward", "episode_cost")}
 
 
 def action_change(run: Setup, packed: ActingState, original: ActingState, environments: int = 8) -> float:

@@ -112,12 +112,14 @@ def _health(state: LearnerState) -> Metrics:
     return found
 
 
-def evaluate_seeds(setup: Setup, episodes: int, deterministic: bool) -> Callable[[ActingState], Metrics]:
+def evaluate_seeds(
+    setup: Setup, episodes: int, deterministic: bool, fresh: bool = False
+) -> Callable[[ActingState], Metrics]:
     """`evaluate` of all seeds: state with a leading [seeds] -> metrics [seeds, episodes]."""
     hyper, _, (axis, _) = setup.vmap_arguments
 
     def one_seed(hyper: Hyper, state: ActingState) -> Metrics:
-        return evaluate(setup, state, episodes, deterministic=deterministic, hyper=hyper)
+        return evaluate(setup, state, episodes, deterministic=deterministic, fresh=fresh, hyper=hyper)
 
     return functools.partial(_over_seeds(setup, one_seed, (axis, 0)), hyper)
 

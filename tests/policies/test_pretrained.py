@@ -160,7 +160,7 @@ def test_packing_costs_no_reward_and_no_safety():
     for name in NAMES:
         facts = hub.about(name)
         for figure, (before, half) in facts["unpacked"].items():
-            after, other_half = facts["figures"][figure]
+            after, other_half = facts["packed"][figure]
             apart.append(abs(after - before) > half + other_half)
         assert facts["action_change"] < 0.02
     assert np.mean(apart) <= 0.05
