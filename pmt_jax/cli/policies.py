@@ -70,7 +70,8 @@ def run_eval(arguments: argparse.Namespace) -> int:
         how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
         how += " of the best policy" if which == "best" else ""
     shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
-    say(f"{arguments.source}: {episodes} episodes a seed, {how}; {shown}")
+    count = f"{episodes} episode{'s' * (episodes > 1)}"
+    say(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
         _say_row(row)
     return 0

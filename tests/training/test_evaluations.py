@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import pathlib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmt_jax.learning.evaluation import interval, is_better
+from pmt_jax import tasks
+from pmt_jax.learning.evaluation import interval, is_better, play
+from pmt_jax.policies import evaluate
 from runs import rows
 
 
@@ -37,8 +41,20 @@ def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
     assert "mean actions of the best policy" in text
     for row in expected:
         assert f"seed {row['seed']} after {row['step']:,} steps" in text
-        assert f"{row['eval/episode_reward']:12.4f} +-" not in text  # from starts that did not choose it
+        assert f"{row['eval/episode_reward']:12.4f} +-" in text
     assert "unknown checkpoint 'bset'; did you mean 'best'?" in cli("eval", whole, "--which", "bset")[2]
+
+
+def test_what_was_chosen_is_evaluated_from_other_starts(monkeypatch):
+    monkeypatch.setattr(evaluate, "load_run", lambda *_: ())
+    monkeypatch.setattr(evaluate, "evaluate_states", lambda *_, fresh: fresh)
+    runs = (("run", "last"), ("run", "best"), ("hub:lane/r4sg", "last"))
+    assert [evaluate.evaluate_run(pathlib.Path(run), 8, True, which) for run, which in runs] == [False, True, True]
+
+    env = tasks.make("noisy")
+    push = jnp.ones((8, *env.spec.action_mask.shape))
+    both = jax.jit(lambda: [play(env, lambda *_: push, 8, fresh=fresh)["episode_cost"] for fresh in (False, True)])()
+    assert not np.array_equal(*both)
 
 
 figures = st.floats(-100, 100, width=32) | st.just(float("nan"))
