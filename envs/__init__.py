@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from . import ant, user, voltage
+from . import ant, user, velocity, voltage
 from .columns import Column
 from .errors import TaskError, did_you_mean
 
@@ -40,6 +40,10 @@ _TASKS = {
     "lane": _Task("toys", "Lane"),
     "switch": _Task("toys", "Switch"),
     "noisy": _Task("toys", "Noisy"),
+    **{
+        f"velocity_{variant}": _Task("velocity.velocity", "Velocity", {"variant": variant}, velocity.COLUMNS)
+        for variant in velocity.VARIANTS
+    },
     "voltage_33": _Task("voltage.control", "VoltageControl", {"case": "case33"}, voltage.COLUMNS),
     "voltage_141": _Task("voltage.control", "VoltageControl", {"case": "case141"}, voltage.COLUMNS),
 }

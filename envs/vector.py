@@ -55,6 +55,12 @@ class Outcome:
 class VectorEnv:
     """`num_envs` copies of an environment with a time limit and auto-reset.
 
+    Args:
+      env: the environment; num_envs: B.
+      horizon: control steps of an episode; the task's own where None.
+      limit_terminates: an episode that reaches the horizon counts as terminated, as it does in SafePO and others of its
+        family, so that nothing bootstraps from what comes after.
+
     Example:
       >>> import envs, jax
       >>> vector = VectorEnv(envs.make("lane"), num_envs=4)
@@ -64,10 +70,11 @@ class VectorEnv:
       (4,)
     """
 
-    def __init__(self, env: Env, num_envs: int, horizon: int | None = None) -> None:
+    def __init__(self, env: Env, num_envs: int, horizon: int | None = None, limit_terminates: bool = False) -> None:
         self.env = env
         self.num_envs = num_envs
         self.horizon = horizon or env.spec.horizon
+        self._limit_terminates = limit_terminates
 
     @property
     def spec(self) -> EnvSpec:
@@ -93,6 +100,8 @@ class VectorEnv:
         terminated = after.terminated | bad
         elapsed = state.elapsed + 1
         truncated = (elapsed >= self.horizon) & ~terminated
+        if self._limit_terminates:
+            terminated, truncated = terminated | truncated, jnp.zeros_like(truncated)
         outcome = Outcome(
             reward=jnp.where(bad, 0, after.reward),
             cost=_where(bad, jnp.ones_like(after.cost), after.cost),

@@ -174,6 +174,11 @@ class Config(Hyper):
     obs_norm: Literal["running", "layernorm", "none"] = learning(
         "running", "observations are scaled by running moments, by layer normalisation, or not at all"
     )
+    time_limit: Literal["truncate", "terminate"] = learning(
+        "truncate",
+        "an episode cut by its time limit bootstraps from the state it was cut in, or ends there as if by the task's "
+        "own rule (SafePO)",
+    )
     cost_estimate: Literal["episode", "rate", "critic"] = constraint(
         "episode",
         "estimate of the episode cost for the multiplier: mean of the episodes that finished in this update, the cost "

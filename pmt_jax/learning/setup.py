@@ -111,7 +111,8 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     env = env or tasks.make(config.task, config.physics, **dict(config.env))
     _check_limits(config, env.spec)
     nets = networks.build(config, env.spec, method.share_actor)
-    return Setup(config, method, tasks.VectorEnv(env, config.num_envs), nets)
+    vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
+    return Setup(config, method, vector, nets)
 
 
 def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:

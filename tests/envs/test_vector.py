@@ -87,3 +87,17 @@ def test_keys_of_resets_never_repeat():
         seen.append(np.asarray(jax.random.key_data(state.env.carry.key)))
         state, _ = step(state, jnp.zeros((4, 2, 2)))
     assert len(np.unique(np.concatenate(seen), axis=0)) == 20
+
+
+def test_a_time_limit_that_terminates_leaves_nothing_to_bootstrap_from():
+    """SafePO's convention: the same episodes, but their ends count as terminations."""
+    env = envs.make("lane")
+    outcomes = []
+    for limit_terminates in (False, True):
+        vector = VectorEnv(env, 2, horizon=2, limit_terminates=limit_terminates)
+        state = vector.reset(jax.random.key(0))
+        for _ in range(2):
+            state, outcome = vector.step(state, jnp.zeros((2, 2, 2)))
+        assert (state.episode == 1).all()
+        outcomes.append((outcome.terminated.tolist(), outcome.truncated.tolist()))
+    assert outcomes == [([False] * 2, [True] * 2), ([True] * 2, [False] * 2)]
