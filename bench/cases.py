@@ -22,12 +22,12 @@ class Case:
       kind: a plain Python loop over C MuJoCo; the environment alone under random actions; the whole training loop;
         the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned.
       task: an environment, or a network for power flows.
-      what: which start, tool or policy.
+      what: which start, tool, policy or walls.
       method, physics, solver: of training and of the engine; the task's own where left out.
       seeds, num_envs: side by side; of power flows the batch, of a baseline its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
-      settings: other settings of the training.
+      settings: other settings of the training; alone, other options of the environment.
     """
 
     kind: Kind
@@ -95,6 +95,10 @@ def _alone(task: str, sizes: Iterable[int], steps: int = 0, seeds: int = 1, **en
     )
 
 
+def _walled(walls: str, **engine: Any) -> tuple[Case, ...]:
+    return _alone("ant_2x4", (64,), what=walls, settings=(("walls", walls),), **engine)
+
+
 def _training(task: str, method: str, seeds: int, num_envs: int, length: int, *more: Any, **engine: Any) -> Case:
     sizes = {"seeds": seeds, "num_envs": num_envs, "rollout_length": length}
     return Case("training", task, method=method, settings=more, **sizes, **engine)
@@ -139,6 +143,15 @@ BENCHES = {
             *_alone("ant_2x4", (16,), physics="mujoco"),
             _training("ant_2x4", "mappo_l", 1, 16, 64, physics="mujoco"),
         ),
+    ),
+    "walls": Bench(
+        "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
+        (
+            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mujoco")),
+            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx", solver="fast")),
+            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx", solver="converged")),
+        ),
+        _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(
         "hands: control steps/s per engine beside plain loops; CPU-seconds to compile",

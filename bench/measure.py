@@ -100,7 +100,7 @@ def _compiled(
 def environment(case: Case) -> Build:
     """jit(scan(vmap(step))) with random actions, and with resets where an episode terminates."""
     named = {"physics": case.physics, "solver": case.solver}
-    env = envs.make(case.task, **{name: word for name, word in named.items() if word})
+    env = envs.make(case.task, **{name: word for name, word in named.items() if word}, **dict(case.settings))
     shape = (case.seeds, case.num_envs)
     step_all, reset_all = jax.vmap(jax.vmap(env.step)), jax.vmap(jax.vmap(env.reset))
 

@@ -81,6 +81,11 @@ def _times_one_seed(row: Row, rows: Rows) -> float | None:
     return ratio and row["seeds"] / ratio
 
 
+def _of_reference_walls(row: Row, rows: Rows) -> float | None:
+    same = {name: row.get(name) for name in ("physics", "solver", "num_envs")}
+    return _over(row, rows, **same, what="reference")
+
+
 def _efficiency(row: Row, rows: Rows) -> float | None:
     ratio = _over(row, rows, task=row["task"], what="one device")
     return ratio and ratio / row.get("devices", 1)
@@ -163,6 +168,8 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "environment steps/s": _rate_or_failure,
     "power flows/s": _rate_or_failure,
     "of plain loop x threads": _shown("{:.2f}", _of_plain),
+    "walls": _shown("{}", "what"),
+    "of reference": _shown("{:.2f}", _of_reference_walls),
     "the same per CPU-second": _shown("{:.2f}", _of_plain_per_cpu),
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
@@ -234,6 +241,9 @@ SIZES = "seeds x environments x steps"
 TABLES: dict[str, Callable[[Reports], str]] = {
     "ant": Table("ant", EVERY, SPEED),
     "starts": Table("ant", ("start",), ("what", "compile cache", "compile, s", "first update, s", "memory, GB")),
+    "walls": Table(
+        "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
+    ),
     "hands": Table("hands", EVERY, (*SPEED, *CPU_SECONDS)),
     "methods": Table(
         "methods",

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.ant import corridor
+from envs.ant.walls import COSTLY_REACH, DANGER, HALF_WIDTH, THICKNESS
 from pmt_jax.errors import UsageError
 from pmt_jax.render.episode import record_run
 from pmt_jax.training.compile import use_cache
@@ -28,7 +29,7 @@ EVERY = 10  # control steps between two points of a path
 
 
 def paths(source: str, episodes: int) -> dict[str, Any]:
-    """A policy's episodes: title, and for each its path [points] of x and y in m, its reward and its cost.
+    """A policy's episodes: title, its task's walls, and for each its path [points] of x, y in m, its reward and cost.
 
     Raises:
       UsageError: there is no such run, or it is not an ant's.
@@ -37,11 +38,12 @@ def paths(source: str, episodes: int) -> dict[str, Any]:
     if not pathlib.Path(source.partition("@")[0]).exists() and "=" in source:  # a sweep's folders have an = themselves
         title, _, place = source.partition("=")
     place, _, seed = place.partition("@")
-    found = []
+    found, walls = [], "reference"
     for number in range(episodes):
         episode = record_run(pathlib.Path(place), int(seed) if seed else None, number)  # hub:... survives a Path
         if "torso_xpos" not in episode.raw:
             raise UsageError(f"{place} is a run of {episode.env.spec.name}; paths are drawn of ants only")
+        walls = episode.env.walls
         x, y, _ = np.asarray(episode.raw["torso_xpos"])[::EVERY].round(2).T
         found.append(
             {
@@ -51,23 +53,31 @@ def paths(source: str, episodes: int) -> dict[str, Any]:
                 "cost": round(float(episode.cost_sum[-1]), 1),
             }
         )
-    return {"title": title or place, "episodes": found}
+    return {"title": title or place, "walls": walls, "episodes": found}
+
+
+def _draw_walls(panel: Any, walls: str, furthest: float) -> None:
+    """Where a step costs, and the walls' lines; solid walls as thick as they are."""
+    x = np.linspace(-5, furthest, 500)
+    centre = -np.asarray(corridor.off_centre(jnp.asarray(x), jnp.zeros(x.shape)))
+    behind = {"reference": DANGER, "costly": 2 * COSTLY_REACH, "solid": 0.0}[walls]
+    for side in (-1, 1):
+        wall = centre + side * HALF_WIDTH
+        panel.fill_between(x, wall - side * DANGER, wall + side * behind, color="#f3c6c0", lw=0)
+        panel.plot(x, wall, color="#a33", lw=1)
+        if walls == "solid":
+            panel.fill_between(x, wall, wall + side * THICKNESS, color="#a33", lw=0)
 
 
 def draw(policies: list[dict[str, Any]], file: pathlib.Path) -> None:
-    """One panel a policy: the corridor, its danger bands, and the paths."""
+    """One panel a policy: the corridor, where it costs, and the paths."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.4 * len(policies)), layout="constrained")
     panels = figure.subplots(len(policies), squeeze=False, sharex=True)[:, 0]
     furthest = min(140.0, max(max(e["x"]) for policy in policies for e in policy["episodes"]) + 5)
-    x = np.linspace(-5, furthest, 500)
-    centre = -np.asarray(corridor.off_centre(jnp.asarray(x), jnp.zeros(x.shape)))
     for panel, policy in zip(panels, policies, strict=True):
-        for side in (-1, 1):
-            wall = centre + side * corridor.HALF_WIDTH
-            panel.fill_between(x, wall - corridor.DANGER, wall + corridor.DANGER, color="#f3c6c0", lw=0)
-            panel.plot(x, wall, color="#a33", lw=1)
+        _draw_walls(panel, policy.get("walls", "reference"), furthest)
         for episode in policy["episodes"]:
             panel.plot(episode["x"], episode["y"], color="#25557f", lw=0.9, alpha=0.8)
         reward, cost = (np.mean([e[name] for e in policy["episodes"]]) for name in ("reward", "cost"))

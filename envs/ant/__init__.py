@@ -4,6 +4,9 @@ from ..columns import Column
 
 COLUMNS = {
     "outside": Column(
-        "outside", "share of steps beyond a wall; walls do not block, and behind their bands nothing costs", 0, 1
+        "outside",
+        "share of steps beyond a wall; reference walls do not block, nor is it costly behind their bands",
+        0,
+        1,
     )
 }

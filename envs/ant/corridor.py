@@ -18,9 +18,6 @@ Example:
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -31,21 +28,16 @@ import numpy as np
 from ..base import Declarations, EnvSpec, Scene, State
 from ..errors import one_of, typed
 from ..physics import PhysicsState, make_engine
+from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model, touching
 
-MODEL = Path(__file__).parent / "ant_corridor.xml"
 SUBSTEPS = 5  # integration steps of 0.01 s in a control step
 CONTROL_DT = 0.05  # s
 HORIZON = 1000  # control steps
 COST_LIMIT = 10.0  # the benchmark's bound on an episode's summed cost
-COSTLY_GEOMS = ("floor", "torso_geom", "foot_1_geom", "foot_2_geom", "foot_3_geom", "foot_4_geom")  # see solver="fast"
 
 RESET_POSITION_NOISE = 0.1  # half-width of the uniform noise on every component of qpos, quaternion included
 RESET_VELOCITY_NOISE = 0.1  # standard deviation of the normal noise on qvel
 
-SLOPE = math.tan(math.radians(30.0))  # of the corridor's centre line, up or down
-FOLDS = (20.0, 60.0, 100.0)  # m along x, where the slope turns over; straight after the last
-HALF_WIDTH = 5.0  # m along y from the centre line to a wall
-DANGER = 1.8  # m along y to either side of a wall
 CONTROL_COST = 0.5
 CONTACT_COST = 0.5e-3
 SURVIVAL = 1.0
@@ -70,12 +62,6 @@ class Carry:
     torso_xpos: jax.Array
 
 
-@functools.cache
-def model() -> mujoco.MjModel:
-    """The compiled MJCF; engines copy it."""
-    return mujoco.MjModel.from_xml_path(str(MODEL))
-
-
 class AntCorridor:
     """See the module; agents share reward, cost and (up to their own index) observation.
 
@@ -86,6 +72,8 @@ class AntCorridor:
       solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
       observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
         learners that keep running moments).
+      walls: `reference` (massless, so they do not block, and 1.8 m behind them nothing costs), `costly` (they do not
+        block, but everything outside costs) or `solid` (they block torso and feet; no gaps).
       threads: of the `mujoco` engine; all usable CPUs where None.
     """
 
@@ -97,28 +85,30 @@ class AntCorridor:
         physics: str = "auto",
         solver: str = "converged",
         observation: str = "zscore",
+        walls: str = "reference",
         threads: int | None = None,
     ):
         one_of("num_agents", str(num_agents), ("2", "4"))
         self._standardise = one_of("observation", observation, ("zscore", "raw")) == "zscore"
+        self.walls = one_of("walls", walls, WALLS)
         torso = model().body("torso").id
         self._engine = make_engine(
-            model(),
+            self.model,
             substeps=SUBSTEPS,
             readout={
                 "torso_xpos": ("xpos", torso),
                 "torso_xquat": ("xquat", torso),
-                "contact_force": ("cfrc_ext", slice(None)),
+                "contact_force": ("cfrc_ext", slice(model().nbody)),  # of the ant; solid walls are bodies too
             },
             physics=physics,
             solver=solver,
-            fast_contacts=COSTLY_GEOMS,
+            fast_contacts=touching(walls),
             threads=threads,
         )
         self.engine = self._engine.name
-        self.declares = Declarations(picture=Scene(self.raw, model(), self.decorate), overflow="physics_overflow")
-        action_dim = model().nu // num_agents
-        state_dim = model().nq - 2 + model().nv + 2
+        self.declares = Declarations(picture=Scene(self.raw, self.model, self.decorate), overflow="physics_overflow")
+        action_dim = self.model.nu // num_agents
+        state_dim = self.model.nq - 2 + self.model.nv + 2
         self.spec = EnvSpec(
             name=f"ant_{num_agents}x{action_dim}",
             num_agents=num_agents,
@@ -186,7 +176,7 @@ class AntCorridor:
     @property
     def model(self) -> mujoco.MjModel:
         """What pictures are drawn from; its geoms include the walls and the danger bands."""
-        return model()
+        return model(self.walls)
 
     def decorate(self, scene: mujoco.MjvScene, raw: dict[str, np.ndarray], cost: float) -> None:
         """Shows the moment of cost in a scene of `model`: a red ant, and bands that glow; see `envs.base`."""
@@ -196,7 +186,7 @@ class AntCorridor:
         for geom in scene.geoms[: scene.ngeom]:
             if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
                 geom.rgba[:] = COSTLY_ANT
-            elif model().geom(geom.objid).name.startswith("danger"):
+            elif self.model.geom(geom.objid).name.startswith("danger"):
                 geom.rgba[3] = COSTLY_BAND
 
     def _initial_state(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
@@ -235,8 +225,8 @@ class AntCorridor:
         return jnp.sum(jnp.stack(list(parts.values()))), parts
 
     def _get_cost(self, torso: jax.Array, terminated: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """1 within 1.8 m (along y) of either wall, on either side of it, or where the ant terminates: [N, 1]."""
-        danger = in_danger(torso[0], torso[1]).astype(torso.dtype)
+        """1 in danger, or where the ant terminates: [N, 1]."""
+        danger = in_danger(torso[0], torso[1], self.walls).astype(torso.dtype)
         ended = terminated.astype(torso.dtype)
         cost = jnp.minimum(danger + ended, 1.0)
         return jnp.full((self.spec.num_agents, 1), cost), {"cost_obj": danger, "cost_done": ended}
@@ -263,12 +253,14 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _location(torso: jax.Array) -> dict[str, jax.Array]:
-    """How far the ant is along x (m), and 1 where it is outside: walls do not block, nor is it costly behind them."""
+    """How far the ant is along x (m), and 1 where it is outside."""
     outside = jnp.abs(off_centre(torso[0], torso[1])) > HALF_WIDTH
     return {"x_position": torso[0], "outside": outside.astype(torso.dtype)}
 
 
-def in_danger(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Whether a point lies in the band along either wall that costs."""
+def in_danger(x: jax.Array, y: jax.Array, walls: str = "reference") -> jax.Array:
+    """Whether a point costs: within 1.8 m (along y) of either wall, and further out where `walls` is not reference."""
     off = off_centre(x, y)
+    if walls != "reference":
+        return jnp.abs(off) > HALF_WIDTH - DANGER
     return jnp.minimum(jnp.abs(off - HALF_WIDTH), jnp.abs(off + HALF_WIDTH)) < DANGER

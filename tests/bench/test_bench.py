@@ -319,8 +319,9 @@ def test_paths_of_ants_are_stored_and_drawn(
         asked.append((str(folder), seed, number))
         walk = np.stack([np.arange(31.0), 2 * np.arange(31.0), np.ones(31)], axis=1)
         raw = {"torso_xpos": walk} if folder.name != "lane" else {}
-        spec = SimpleNamespace(spec=SimpleNamespace(name="lane"))
-        return SimpleNamespace(raw=raw, env=spec, reward_sum=np.array([1.0, 5.0]), cost_sum=np.array([0.0, 2.0]))
+        walls = {"x": "solid", "r4sg": "costly"}.get(folder.name, "reference")
+        env = SimpleNamespace(spec=SimpleNamespace(name="lane"), walls=walls)
+        return SimpleNamespace(raw=raw, env=env, reward_sum=np.array([1.0, 5.0]), cost_sum=np.array([0.0, 2.0]))
 
     monkeypatch.setattr(ant_paths, "record_run", record)
     monkeypatch.setattr(ant_paths, "EPISODES", 2)
@@ -332,6 +333,7 @@ def test_paths_of_ants_are_stored_and_drawn(
     assert asked == [(*place, number) for place in places for number in (0, 1)]
     first, *others = json.loads((tmp_path / "paths.json").read_text())
     assert [first["title"], *(p["title"] for p in others)] == ["Who turns", "hub:ant_2x4/r4sg", str(point), "R4SG"]
+    assert [first["walls"], *(p["walls"] for p in others)] == ["solid", "costly", "reference", "reference"]
     assert first["episodes"][0] == {"x": [0, 10, 20, 30], "y": [0, 20, 40, 60], "reward": 5.0, "cost": 2.0}
     ant_paths.main(files)  # again, of what is stored
     assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")

@@ -23,9 +23,9 @@ from pmt_jax.errors import UsageError
 from pmt_jax.render import episode, film, gl, network_map, page, report
 
 
-def still(name: str, raw: dict[str, np.ndarray], cost: list[float]) -> episode.Episode:
+def still(name: str, raw: dict[str, np.ndarray], cost: list[float], **options: str) -> episode.Episode:
     """An episode made by hand, of the raw quantities given."""
-    env = tasks.make(name)
+    env = tasks.make(name, **options)
     costs = np.array(cost)
     zero = np.zeros_like(costs)
     return episode.Episode(
@@ -115,6 +115,24 @@ def test_a_scene_holds_walls_bands_and_the_moment_of_cost(ant: episode.Episode):
     assert torso[2, 3] > 3 * torso[2, 4] and torso[1, 3] < 2 * torso[1, 4]  # red, and only then
     assert looks[2]["danger_left_1"][-1] > 1.5 * looks[1]["danger_left_1"][-1]
     assert looks[2]["wall_left_1"] == looks[1]["wall_left_1"]
+
+
+@pytest.mark.parametrize(("walls", "count"), [("costly", 6), ("solid", 8)])
+def test_a_scene_shows_walls_as_they_are(walls: str, count: int, ant: episode.Episode):
+    """Bands reach as far as it costs, solid walls have their thickness; neither turns red with the ant."""
+    from pmt_jax.render import scenes
+
+    shown = still("ant_2x4", ant.raw, ant.cost.tolist(), walls=walls)
+    looks = []
+    for scene in scenes.scenes(shown):
+        geoms = {shown.env.model.geom(g.objid).name: g for g in scene.geoms[: scene.ngeom]}
+        looks.append({name: (g.size.tolist(), g.rgba.tolist()) for name, g in geoms.items()})
+    assert sum(name.startswith("wall") for name in looks[0]) == count
+    assert sum(name.startswith("danger") for name in looks[0]) == 8
+    assert looks[2]["wall_left_1"] == looks[1]["wall_left_1"]
+    assert looks[2]["danger_left_1"][1][3] > 1.5 * looks[1]["danger_left_1"][1][3]
+    assert (looks[0]["wall_right_2"][0][1] == 0.5) == (walls == "solid")
+    assert (looks[0]["danger_right_2"][0][1] > 10) == (walls == "costly")
 
 
 def test_the_page_gets_the_geoms_of_the_scene(ant: episode.Episode):

@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import envs
-from envs.ant import corridor
+from envs.ant import corridor, walls
 from envs.errors import TaskError
 from places import DATA
 
@@ -120,7 +120,7 @@ def test_4x2_observations_on_mjx_from_its_2x4_states(replay):
 def test_walls_explain_the_rows_that_miss_the_tolerance():
     """With the six milligram boxes as free bodies, as in the original, those rows agree too."""
     rows = {k: v[inside_wall(recording("ant_2x4"))] for k, v in recording("ant_2x4").items()}
-    spec = mujoco.MjSpec.from_file(str(corridor.MODEL))
+    spec = mujoco.MjSpec.from_file(str(walls.MODEL))
     for x, yaw in ((0, 30), (40, -30), (80, 30)):
         for y in (5, -5):
             half = np.radians(yaw) / 2
@@ -273,14 +273,100 @@ def test_centre_line_is_continuous_at_the_folds():
         assert abs(left - right) < 2e-3
 
 
-def test_an_ant_behind_a_wall_is_outside_and_behind_the_band_costs_nothing():
-    env, step = stepper("mujoco")
+@functools.cache
+def walled(kind: str, physics: str = "mujoco"):
+    env = envs.make("ant_2x4", physics=physics, walls=kind)
+    return env, jax.jit(jax.vmap(env.step))
+
+
+def centre(x: float) -> float:
+    return -float(corridor.off_centre(np.float64(x), np.float64(0.0)))
+
+
+@pytest.mark.parametrize(("kind", "costs"), [("reference", [0, 1, 1, 1, 1, 0]), ("costly", [0, 1, 1, 1, 1, 1])])
+def test_an_ant_behind_a_wall_is_outside_and_behind_the_band_reference_walls_cost_nothing(kind, costs):
+    env, step = walled(kind)
     rest = np.asarray(env.raw(env.reset(jax.random.key(0)))["qpos"])
-    centre = 10 * np.tan(np.pi / 6)  # of the corridor, at x = 30
-    qpos = np.stack([np.r_[30.0, centre + off, rest[2:]] for off in (0.0, -4.5, 4.5, -5.5, 5.5, 9.0)])
+    qpos = np.stack([np.r_[30.0, centre(30.0) + off, rest[2:]] for off in (0.0, -4.5, 4.5, -5.5, 5.5, 9.0)])
     after = step(jax.vmap(env.restore)(qpos, np.zeros((6, 14))), jnp.zeros((6, 2, 4)))
     np.testing.assert_array_equal(after.info["outside"], [0, 0, 0, 1, 1, 1])
-    np.testing.assert_array_equal(after.cost[:, 0, 0], [0, 1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(after.cost[:, 0, 0], costs)
+
+
+@pytest.mark.parametrize("kind", ["costly", "solid"])
+def test_away_from_walls_every_kind_of_wall_is_the_reference(kind):
+    """Equal to the last bit where no foot can touch a wall, and for costly walls everywhere but in the cost outside."""
+    rows = recording("ant_2x4")
+    actions = rows["action"].reshape(-1, 2, 4).astype(np.float32)
+    (env, step), (_, reference) = walled(kind), walled("reference")
+    expected, actual = reference(restored(env, rows), actions), step(restored(env, rows), actions)
+    off = np.abs(np.asarray(corridor.off_centre(*rows["torso_xpos1"][:, :2].T)))
+    free = np.ones_like(off, bool) if kind == "costly" else off < 3.0
+    assert free.sum() > 600
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[free], b[free]), actual.carry, expected.carry)
+    np.testing.assert_array_equal(actual.reward[free], expected.reward[free])
+    costs = np.maximum(np.asarray(expected.cost[:, 0, 0]), off > 5) if kind == "costly" else expected.cost[:, 0, 0]
+    np.testing.assert_array_equal(actual.cost[free, 0, 0], costs[free])
+
+
+def thrown(env, speed: float):
+    """Ants on every straight of the corridor that fly towards either wall."""
+    rest = np.asarray(env.raw(env.reset(jax.random.key(0)))["qpos"])
+    places = [(x, side) for x in (-50.0, 5.0, 19.0, 40.0, 59.0, 75.0, 99.0, 130.0, 400.0) for side in (1, -1)]
+    qpos = np.stack([np.r_[x, centre(x) + 2 * side, 0.5, rest[3:]] for x, side in places])
+    qvel = np.zeros((len(places), 14))
+    qvel[:, 1] = [side * speed for _, side in places]
+    return jax.vmap(env.restore)(qpos, qvel)
+
+
+@functools.cache
+def flight(kind: str, steps: int = 30) -> list:
+    """The states of thrown ants on the C engine. At 8 m/s they are faster than trained ants."""
+    env, step = walled(kind)
+    states = [thrown(env, speed=8.0)]
+    for _ in range(steps):
+        states.append(step(states[-1], jnp.zeros((len(states[0].reward), 2, 4))))
+    return states
+
+
+@pytest.mark.parametrize(("kind", "furthest"), [("costly", (5.5, 30)), ("solid", (3.5, 4.9))])
+def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
+    """A torso of radius 0.25 touches a wall at 30 degrees 0.29 m (along y) before its centre would reach it."""
+    places = np.stack([state.carry.torso_xpos[:, :2] for state in flight(kind)])
+    off = np.abs(np.asarray(corridor.off_centre(places[..., 0], places[..., 1]))).max(axis=0)
+    assert (furthest[0] < off).all() and (off < furthest[1]).all()
+
+
+@pytest.mark.full
+def test_mjx_feels_solid_walls_as_c_does():
+    env, step = walled("solid", "mjx")
+    states = flight("solid")[:16]
+    errors, touched = [], []
+    for before, after, free in zip(states, states[1:], flight("costly")[1:], strict=False):
+        ours = step(jax.vmap(env.restore)(**jax.vmap(env.raw)(before)), jnp.zeros((len(before.reward), 2, 4)))
+        errors.append(np.abs(ours.carry.physics.qpos - after.carry.physics.qpos).max(axis=1))
+        touched.append(np.abs(after.carry.physics.qpos - free.carry.physics.qpos).max(axis=1) > 1e-3)
+    errors, touched = np.concatenate(errors), np.concatenate(touched)
+    assert touched.sum() > 50
+    assert np.median(errors[touched]) < 1e-4 and errors[~touched].max() < 1e-4
+
+
+def test_solid_walls_leave_no_gap():
+    """Points just outside the walls' lines are inside a box, points just inside are not, for 500 m either way."""
+    model = walls.model("solid")
+    boxes = [model.geom(i) for i in range(model.ngeom) if model.geom(i).name.startswith("wall")]
+    x = np.r_[np.arange(-500, 500, 0.37), 20, 60, 100, 20 + 1e-6, 60 - 1e-6, 60 + 1e-6]
+    x = x[x != 60]  # the reference's centre line jumps there
+    line = -np.asarray(corridor.off_centre(x, np.zeros_like(x)))
+    for side in (1, -1):
+        for beyond, blocked in ((0.01, True), (-0.01, False)):
+            points = np.stack([x, line + side * (5 + beyond), np.full_like(x, 0.3)], axis=1)
+            inside = np.zeros(len(x), bool)
+            for box in boxes:
+                body, rotation = model.body(box.bodyid[0]), np.zeros(9)
+                mujoco.mju_quat2Mat(rotation, body.quat)
+                inside |= (np.abs((points - body.pos) @ rotation.reshape(3, 3)) <= box.size).all(axis=1)
+            assert (inside == blocked).all()
 
 
 def test_broken_physics_terminates_and_shows():
@@ -303,6 +389,7 @@ def test_fast_solver_stays_near_the_converged_one():
         ({"physics": "mujco"}, "did you mean 'mujoco'"),
         ({"solver": "quick"}, "unknown solver"),
         ({"observation": "zscor"}, "did you mean 'zscore'"),
+        ({"walls": "solids"}, "did you mean 'solid'"),
         ({"threads": 0}, "threads must be at least 1"),
         ({"phisics": "mjx"}, "did you mean 'physics'"),
     ],
