@@ -1,4 +1,4 @@
-"""What of MJX is replaced while it is traced: contacts of capsules with planes, of balls with boxes; the line search."""
+"""What of MJX is replaced while it is traced: contacts of capsules with planes and boxes, and the line search."""
 
 from __future__ import annotations
 
