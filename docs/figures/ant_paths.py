@@ -43,7 +43,8 @@ def paths(source: str, episodes: int) -> dict[str, Any]:
         episode = record_run(pathlib.Path(place), int(seed) if seed else None, number)  # hub:... survives a Path
         if "torso_xpos" not in episode.raw:
             raise UsageError(f"{place} is a run of {episode.env.spec.name}; paths are drawn of ants only")
-        walls = episode.env.walls
+        ant: Any = episode.env
+        walls = ant.walls
         x, y, _ = np.asarray(episode.raw["torso_xpos"])[::EVERY].round(2).T
         found.append(
             {

@@ -165,7 +165,7 @@ def _ball_box(
     off = jnp.clip(place, -size, size) - place
     apart = jnp.linalg.norm(off)
     depth = size - jnp.abs(place)
-    inside, nearest = apart == 0, jnp.argmin(depth)
+    inside, nearest = jnp.equal(apart, 0), jnp.argmin(depth)
     inward = -jnp.sign(place[nearest]) * jax.nn.one_hot(nearest, 3, dtype=place.dtype)
     normal = rotation @ jnp.where(inside, inward, off / jnp.where(inside, 1.0, apart))
     distance = jnp.where(inside, -depth[nearest], apart) - radius
