@@ -168,7 +168,7 @@ def _ball_box(
     inside, nearest = jnp.equal(apart, 0), jnp.argmin(depth)
     inward = -jnp.sign(place[nearest]) * jax.nn.one_hot(nearest, 3, dtype=place.dtype)
     normal = rotation @ jnp.where(inside, inward, off / jnp.where(inside, 1.0, apart))
-    distance = jnp.where(inside, -depth[nearest], apart) - radius
+    distance = jax.lax.select(inside, -depth[nearest], apart) - radius
     return distance, centre + normal * (radius + 0.5 * distance), make_frame(normal)
 
 
