@@ -2,7 +2,9 @@
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
 bench/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` stands for the
-table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run.
+table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
+`paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks. The study's
+forms are in bench/study.py.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from .tables import TABLES, Reports
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
-STORED = {"curves": runs.as_pmt_table, "points": runs.as_points, **study.FORMS}
+STORED = {**runs.FORMS, **study.FORMS}
 
 
 def documents() -> list[pathlib.Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,6 +103,45 @@ def as_pmt_table(file: pathlib.Path) -> str:
     return table.render(in_order([_row(run) for run in load(file)]), "markdown").split("\n\n")[0]
 
 
+def as_paper(file: pathlib.Path) -> str:
+    """A line a run: mean ± standard deviation over seeds, as the paper has it, then the paper's own figures."""
+    found = table.summarise(in_order([_row(run) for run in load(file)]))
+    measured = [name for name in ("reward", "cost", "CR", "PL") if name in found[0]]
+    published = [name for name in measured if any(name in row["paper"] for row in found)]
+    head = ["method", *measured, "seeds within", "worst seed", *(f"paper {name}" for name in published)]
+    several = len({row["cost_limit"] for row in found}) > 1
+    body = []
+    for row in found:
+        line = [row["method"] + (f", limit {row['cost_limit']:g}" if several else "")]
+        line += [_mean_std(row[name]["mean"], row[name]["std"]) for name in measured]
+        line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", f"{row['worst']:.2f}"]
+        line += [_mean_std(*row["paper"][name]) if name in row["paper"] else "-" for name in published]
+        body.append(line)
+    return markdown(head, body)
+
+
+def as_summary(files: pathlib.Path) -> str:
+    """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
+    found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
+    tasks = list(dict.fromkeys(row.task for row in found))
+    cells = {(x["method"], x["task"]): x for x in table.summarise(found)}
+    body = []
+    for method in METHODS:
+        line = [cells[method, task] for task in tasks]
+        words = [
+            f"{x['reward']['mean']:,.4g} / {x['cost']['mean']:.3g}, {round(x['within'] * x['seeds'])} of {x['seeds']}"
+            for x in line
+        ]
+        body.append([f"`{method}`", *words])
+    limits = {row.task: row.cost_limit for row in found}
+    return markdown(["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)], body)
+
+
+def _mean_std(mean: float, std: float) -> str:
+    digits = 2 if abs(mean) >= 1 else 4
+    return f"{mean:,.{digits}f} ± {std:,.{digits}f}"
+
+
 def _row(run: Run) -> Row:
     scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
     return Row(run["task"], run["method"], "", run["cost_limit"], max(run["steps"]), run["source"], scores)
@@ -120,3 +159,11 @@ def as_points(file: pathlib.Path) -> str:
 
     body = [[run["task"], run.get("label", run["method"]), *(cell(run["table"][c]) for c in present)] for run in found]
     return markdown(("task", "method", *present), body)
+
+
+FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+    "curves": as_pmt_table,
+    "points": as_points,
+    "paper": as_paper,
+    "summary": as_summary,
+}

@@ -175,6 +175,38 @@ def as_equivalence(file: pathlib.Path) -> str:
     return markdown(["measure", "R4SG less MAPPO-L [90 %]", "bounds", "p", "answer"], body)
 
 
+def as_headline(file: pathlib.Path) -> str:
+    """MAPPO-L beside F4SG at every p, with the multiplier that both share."""
+    found = runs.load(file)
+    base = min(runs.curves(run).settings["lambda_init"] for run in found)
+    body = []
+    for p in sorted({_share(run) for run in found}, reverse=True):
+        same = [x for x in found if _share(x) == p and runs.curves(x).settings["lambda_init"] == base]
+        pair = [(x, measures(x)) for name in ("mappo_l", "f4sg") for x in same if x["method"] == name]
+        unsafe = [f"{(own['end'] > x['cost_limit'] / p).sum()} of {len(own['end'])}" for x, own in pair]
+        ends, rewards = ([_mean_sd(own[measure]) for _, own in pair] for measure in ("end", "reward"))
+        body.append([f"{p:g}", *(" / ".join(cell) for cell in (ends, rewards, unsafe))])
+    return markdown(["p", "true cost, MAPPO-L / F4SG", "reward", "seeds beyond the limit"], body)
+
+
+def as_weights(file: pathlib.Path) -> str:
+    """How far regret's weight on the ratio is from 1: a row for each run with regret, means over its seeds."""
+    body = []
+    for run in sorted(runs.load(file), key=lambda run: (-_share(run), list(NAMES).index(run["method"]))):
+        mean, std = (np.array(run["diagnostics"].get(f"regret/weight_{x}", ())) for x in ("mean", "std"))
+        if std.size:
+            line = [run["task"], f"{_share(run):g}", NAMES[run["method"]]]
+            body.append([*line, f"{mean.min():.4f} to {mean.max():.4f}", f"{std.max():.4f}", f"{std[-1]:.4f}"])
+    head = [
+        "task",
+        "p",
+        "method",
+        "mean of the weight, lowest to highest chunk",
+        "its standard deviation, highest chunk",
+    ]
+    return markdown([*head, "last chunk"], body)
+
+
 def _mean_sd(x: Scores) -> str:
     form = ".0f" if abs(x.mean()) >= 100 else ".1f"
     return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
@@ -188,4 +220,6 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "study": as_study,
     "lag": as_lag,
     "equivalence": as_equivalence,
+    "weights": as_weights,
+    "headline": as_headline,
 }

@@ -234,6 +234,27 @@ def hub(reports: Reports) -> str:
     return f"{markdown(head, body)}\n\n{len(rows)} policies, {total / 1000:.0f} kB in all."
 
 
+def peers(reports: Reports) -> str:
+    """Speed in four rows, beside what one would use instead."""
+    ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
+    (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
+    (alone,) = matching(ant["rows"], kind="environment", physics="mujoco", num_envs=256)
+    (gpu,) = matching(engines["rows"], task="ant_2x4", seeds=1, num_envs=16384, solver=None)
+    (hands,) = matching(engines["rows"], task="hand_over_2x6", num_envs=16384, solver=None)
+    case = {row["what"]: row for row in matching(grid["rows"], kind="power flow", task="case141", num_envs=1024)}
+    ours, theirs = case["ours f32"], case["power-grid-model iterative_current"]
+    cpu, h200 = f"{ant['machine']['cpu']}, 2 threads", f"1 {engines['device']}"
+    head = ("what", "machine", "here, per second", "instead", "per second")
+    lines = (
+        ("ant, control steps", cpu, alone, "plain Python loops over C MuJoCo", plain),
+        ("ant, control steps", h200, gpu, "the same loops on those 2 threads", plain),
+        ("hands, control steps", h200, hands, "", None),
+        ("141 buses, power flows", cpu, ours, "power-grid-model", theirs),
+    )
+    body = [(a, b, f"{rate(c):,.0f}", d, f"{rate(e):,.0f}" if e else "") for a, b, c, d, e in lines]
+    return markdown(head, body)
+
+
 SPEED = ("", "engine", "environments", "environment steps/s", "of plain loop x threads")
 CPU_SECONDS = ("the same per CPU-second", "trace, CPU-s", "compile, CPU-s")
 EVERY = ("plain loop", "environment", "training")
@@ -272,4 +293,5 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
     "hub": hub,
+    "peers": peers,
 }

@@ -233,6 +233,15 @@ def test_rendering_replaces_blocks_and_nothing_else():
             render.render(broken, reports)
 
 
+def test_the_readme_is_short_and_its_figures_are_made():
+    text = render.BLOCK.sub("", (ROOT / "README.md").read_text())
+    assert len(text.split()) <= 900
+    prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)|^\|.*?$", "", text, flags=re.DOTALL | re.MULTILINE)
+    figures = set(re.findall(r"(?<![\w.-])\d[\d.,]*\d|(?<![\w.-])\d", prose))
+    # Python's versions, the ant's limit, the study's seeds a cell, how exactly recordings replay, ODbL's version.
+    assert figures == {"3.11", "3.13", "10", "20", "1", "1.0"}
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Stored runs
 

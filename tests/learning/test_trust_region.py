@@ -46,7 +46,7 @@ def exact(g: np.ndarray, b: np.ndarray, c: float, h: np.ndarray, delta: float) -
 
 
 def test_direction_against_an_exact_solver():
-    """3,000 random problems in float64, as the specification's script ran them."""
+    """3,000 random problems in float64."""
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(3000, 4, 4))
     h = roots @ roots.transpose(0, 2, 1) + 0.5 * np.eye(4)

@@ -241,7 +241,7 @@ def test_standing_still_earns_993_and_costs_nothing():
 
 
 def plain_danger(x: float, y: float) -> bool:
-    """The cost band as the specification words it, without JAX."""
+    """The cost band of the benchmark, without JAX."""
     slope = np.tan(np.pi / 6)
     if x < 20:
         centre = x * slope
