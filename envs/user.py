@@ -178,7 +178,7 @@ def _guard(what: str, run: Callable[[], Any]) -> Any:
     """Runs code of the user's and turns what it raises into one sentence with its line."""
     try:
         return run()
-    except Exception as error:  # a user's file may raise anything
+    except (Exception, SystemExit) as error:  # a user's file may raise anything
         lines = traceback.extract_tb(error.__traceback__)
         own = [line for line in lines if pathlib.Path(line.filename).parent != pathlib.Path(__file__).parent]
         line = (own or lines)[-1]

@@ -22,6 +22,9 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
     """
     partial = out.with_stem(f".{out.stem}.partial")
     try:
+        if out.exists() and not out.is_file() and not out.is_dir():
+            yield out  # a device or a pipe, as /dev/stdout, is written and never replaced
+            return
         out.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         partial.replace(out)

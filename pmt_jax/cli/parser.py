@@ -20,6 +20,10 @@ HELP = ("-h", "--help")
 class Parser(argparse.ArgumentParser):
     """Raises one sentence, with the nearest known word, instead of printing its usage and exiting."""
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$|-inf$")  # argparse knows no -1e-3
+
     def error(self, message: str) -> NoReturn:
         """Raises argparse's message, or the sentence of one of the types below."""
         fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)
@@ -28,6 +32,8 @@ class Parser(argparse.ArgumentParser):
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
         """As `parse_args`, but an unknown flag gets the nearest known one."""
         known, unknown = self.parse_known_args(argv)
+        if unknown and not unknown[0].startswith("-"):
+            raise UsageError(f"unexpected word '{unknown[0]}' (see {self.prog} {known.command} --help)")
         if unknown:
             flags = [f for a in _actions(self, known) for f in a.option_strings]
             raise UsageError(f"unknown argument '{unknown[0]}'{did_you_mean(unknown[0].split('=')[0], flags)}")

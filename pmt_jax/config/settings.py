@@ -65,11 +65,11 @@ class Hyper:
         "bound on how far an update by clipped epochs moves a policy, mean KL in nats; a longer step is shortened",
         Bound("be a number of nats above 0, or inf", lambda x: x > 0),
     )
-    max_grad_norm: float = learning(10.0, "gradients are scaled down to this global norm", NOT_NEGATIVE)
+    max_grad_norm: float = learning(10.0, "gradients are scaled down to this global norm", POSITIVE)
     gamma: float = learning(0.99, "discount per control step, for reward and cost alike", SHARE)
     gae_lambda: float = learning(0.95, "lambda of generalised advantage estimation, for reward and cost alike", SHARE)
     clip: float = learning(
-        0.2, "half-width of the interval to which probability ratios and values are clipped", NOT_NEGATIVE
+        0.2, "half-width of the interval to which probability ratios and values are clipped", POSITIVE
     )
     entropy_coef: float = learning(
         0.0, "weight of the policy's entropy, in nats summed over action dimensions", NOT_NEGATIVE
@@ -79,7 +79,7 @@ class Hyper:
         math.nan,
         "allowed undiscounted cost of one agent per episode, one number for every cost or a list with one for each; "
         "nan takes the task's own",
-        Bound("be a cost per episode of at least 0", lambda x: _is_limit(x)),
+        Bound("be a cost per episode of at least 0 that fits 32 bits", lambda x: _is_limit(x)),
     )
     cost_seen: float = constraint(
         1.0,
@@ -294,7 +294,8 @@ def load_config(
     table = source if isinstance(source, dict) else _read(source)
     source = "a [[sweep]]" if isinstance(source, dict) else source
     own = table.get("method")
-    method = method or (own if isinstance(own, str) else str(Config.method))
+    if method is None:
+        method = own if isinstance(own, str) else str(Config.method)
     if method not in METHODS:
         raise UsageError(f"unknown method '{method}'{did_you_mean(method, METHODS)}")
     layers = [_for_method(source, table, method), _for_method(preset, toml.read_preset(preset), method), overrides]

@@ -147,9 +147,11 @@ def from_words(source: Source, words: Sequence[str], draws: int = 0, seed: int =
     values, ranges = {}, {}
     for word in words:
         name, _, text = word.partition("=")
-        if not text.strip(","):
+        if not text.strip(",") or text.count("[") != text.count("]"):
             raise UsageError(f"--set takes NAME=VALUE,VALUE,..., or with --random NAME=LOW:HIGH, not '{word}'")
         name = name.replace("-", "_")
+        if name in values or name in ranges:
+            raise UsageError(f"--set names {name} twice: give all its values at once, {name}=VALUE,VALUE")
         if found := _range(text):
             ranges[name] = found
         else:

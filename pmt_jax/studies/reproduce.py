@@ -28,7 +28,8 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
       UsageError: an unknown table or budget, or a task that cannot run here.
     """
     paper = table.paper()
-    for what, word, known in (("table", name, paper["tables"]), ("budget", budget, paper["budgets"])):
+    choices = (("table", name, paper["tables"]), ("budget", budget, paper["budgets"]), ("format", form, table.FORMATS))
+    for what, word, known in choices:
         if word not in known:
             raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
     wanted, settings = paper["tables"][name], paper["budgets"][budget]

@@ -67,6 +67,8 @@ def train(
     check_loggers(loggers)
     if not processes.is_first():
         say, loggers, profile = silent, (), None
+    if profile is not None:
+        profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(make_setup(config), trials=trials, mesh=sharding.make_mesh(config, count))
