@@ -79,7 +79,7 @@ class Session:
         self._compiled.set()
 
     def wait_until_it_trains(self) -> None:
-        self._compiled.wait(120)
+        self._compiled.wait(400)
 
     def end(self, kind: int | str, disk: pathlib.Path) -> None:
         """Ends it, or disturbs it and waits for its end; checks that nothing finished is lost."""
@@ -89,7 +89,7 @@ class Session:
                 os.close(os.dup2(os.open(os.devnull, os.O_RDONLY), self.process.stdout.fileno()))
             elif isinstance(kind, int):
                 self.process.send_signal(kind)
-            code = self.process.wait(120)
+            code = self.process.wait(400)  # on a loaded machine
         assert self.process.stderr
         err = self.process.stderr.read()
         allowed = {0, 1, 2} if kind == "full disk" else {0} if isinstance(kind, str) else {0, -kind, 128 + kind}
