@@ -32,6 +32,7 @@ def test_the_example_is_short():
     assert len(EXAMPLE.read_text().splitlines()) <= 60
 
 
+@pytest.mark.full
 def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monkeypatch):
     out = tmp_path / "run"
     monkeypatch.chdir(EXAMPLE.parent)
@@ -47,6 +48,7 @@ def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monk
     assert code == 0 and "info/tilt" in text
 
 
+@pytest.mark.full
 def test_training_stops_where_the_physics_lost_contacts(tmp_path: pathlib.Path, cli):
     """As MJX-Warp says it did where its buffers were too small; here from the fourth control step on."""
     (tmp_path / "lossy.py").write_text(

@@ -47,12 +47,15 @@ def test_pid_weighs_costs_by_three_terms():
     )
 
 
+@pytest.mark.full
 def test_happo_and_mappo_are_the_same_with_one_agent():
     happo, mappo = (trained(method, env=(("num_agents", 1),))[0] for method in ("happo", "mappo"))
     chex.assert_trees_all_equal(weights(happo), weights(mappo))
 
 
-@pytest.mark.parametrize(("method", "without"), [("r4sg", "mappo_l"), ("mixed", "f4sg")])
+@pytest.mark.parametrize(
+    ("method", "without"), [("r4sg", "mappo_l"), pytest.param("mixed", "f4sg", marks=pytest.mark.full)]
+)
 def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without: str):
     chex.assert_trees_all_equal(weights(trained(method, regret_max=0.0)[0]), weights(trained(without)[0]))
 

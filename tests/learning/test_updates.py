@@ -38,6 +38,7 @@ class TwoDangers(Lane):
 # One program
 
 
+@pytest.mark.full
 def test_a_trial_does_not_feel_the_others_of_its_program():
     """Three seeds with a multiplier's learning rate each."""
     config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 400})
@@ -125,7 +126,7 @@ def test_learning_rates_of_all_networks_halve_in_their_half_life():
         chex.assert_trees_all_equal(second.actor, made.step(plain, first)[0].actor)
 
 
-@pytest.mark.parametrize("method", ["mappo", "r4sg"])
+@pytest.mark.parametrize("method", ["mappo", pytest.param("r4sg", marks=pytest.mark.full)])
 def test_an_update_moves_no_policy_further_than_kl_max(method: str):
     """A shared actor moves for all agents at once, so its bound holds for their mean."""
     made = program(method)

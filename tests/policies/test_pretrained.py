@@ -58,6 +58,7 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
     return out
 
 
+@pytest.mark.full
 def test_the_best_policy_of_a_run_is_published_and_used_by_name(empty_hub: pathlib.Path, tmp_path: pathlib.Path, cli):
     # The lane's point comes to rest at twice the push; beyond 0.5 it costs, the nearer to 1 the better.
     out = untrained(tmp_path / "lane", last=(0.5, 0.0), best=(0.2, 0.1))

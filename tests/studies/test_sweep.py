@@ -134,6 +134,7 @@ def test_killed_while_the_points_are_written(swept: pathlib.Path, tmp_path: path
     assert without_seconds(rows(tmp_path / NAMES[1])) == without_seconds(rows(swept / NAMES[1]))
 
 
+@pytest.mark.full
 def test_points_of_one_program_keep_to_their_own_limits(tmp_path: pathlib.Path, cli):
     """What a row says, what the multiplier answers to, and which policy is the best so far."""
     small = ("--num-envs", 8, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--steps", 4000)
@@ -160,6 +161,7 @@ def test_what_is_traced_shares_a_program_and_what_is_static_does_not(tmp_path: p
 # The paper's tables
 
 
+@pytest.mark.full
 def test_reproduce_runs_what_is_missing_and_prints_it(alone: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     tiny = {"seeds": 2, "num_envs": 4, "rollout_length": 25, "minibatches": 1, "hidden": [8], "epochs": 1}
     tiny |= {"log_interval": 2, "critic_lr": 0.001}  # the run alone, whose program is in the compile cache

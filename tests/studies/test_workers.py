@@ -95,7 +95,11 @@ while True:
 
 @pytest.mark.parametrize(
     ("sent", "heard"),
-    [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGTERM), (signal.SIGKILL, signal.SIGTERM)],
+    [
+        pytest.param(signal.SIGINT, signal.SIGINT, marks=pytest.mark.full),
+        pytest.param(signal.SIGTERM, signal.SIGTERM, marks=pytest.mark.full),
+        (signal.SIGKILL, signal.SIGTERM),
+    ],
 )
 def test_programs_end_with_the_one_that_started_them(tmp_path: pathlib.Path, sent: int, heard: int):
     files = [tmp_path / "one", tmp_path / "two"]
@@ -109,6 +113,7 @@ def test_programs_end_with_the_one_that_started_them(tmp_path: pathlib.Path, sen
     until(lambda: [file.read_text() for file in files] == [str(int(heard))] * 2)
 
 
+@pytest.mark.full
 def test_a_sweep_of_two_programs_at_a_time(tmp_path: pathlib.Path, cli):
     tiny = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--minibatches", 1, "--epochs", 1)
     tiny += ("--method", "happo", "--steps", 400, "--no-cache", "--out")

@@ -116,6 +116,7 @@ class Broken(Lane):  # finite for actions of 0 and 1, with which a task is check
 """
 
 
+@pytest.mark.full
 def test_a_task_whose_reward_is_never_finite_stops(tmp_path: pathlib.Path, cli):
     file = tmp_path / "broken.py"
     file.write_text(NAN_REWARDS)
