@@ -125,6 +125,12 @@ _TOOLS = ("power-grid-model iterative_current", "power-grid-model newton_raphson
 _SINGLE_TOOLS = ("lightsim2grid", "lightsim2grid, solve only", "pandapower")
 _OURS = ("ours f32", "ours f64")
 
+# One task of each robot: what its motors are shared out as makes no difference to the speed.
+ROBOTS = tuple(
+    f"velocity_{name}"
+    for name in ("ant_2x4", "half_cheetah_2x3", "hopper_3x1", "walker2d_2x3", "swimmer_2x1", "humanoid_9_8")
+)
+
 BENCHES = {
     "ant": Bench(
         "ant: control steps/s per engine beside plain loops, alone and training; seconds to start; memory, GB",
@@ -161,6 +167,11 @@ BENCHES = {
             *_alone("hand_over_2x6", (64, 256), physics="mjx"),
         ),
         (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
+    ),
+    "velocity": Bench(
+        "velocity tasks: control steps/s of each robot beside plain loops",
+        tuple(case for task in ROBOTS for case in (*_plain(task), *_alone(task, (64, 256), physics="mujoco"))),
+        (*_plain("velocity_hopper_3x1"), *_alone("velocity_hopper_3x1", (64,), physics="mujoco")),
     ),
     "methods": Bench(
         "every method: seconds to compile and per update, steps/s of the whole training loop",
@@ -208,6 +219,7 @@ BENCHES = {
             *_alone("hand_over_2x6", (4096, 16_384), 100, physics="warp"),
             *_alone("hand_over_2x6", (16_384,), 100, physics="warp", solver="fast"),
             *_alone("hand_over_2x6", (4096,), 20, physics="mjx"),
+            *(case for task in ROBOTS for case in _alone(task, (16_384,), 100, physics="warp")),
             *(case for task in ("voltage_33", "voltage_141") for case in _alone(task, (4096, 65_536), 240)),
         ),
         _alone("voltage_33", (64,), 60),

@@ -8,9 +8,10 @@ worth 6 % on the ant.
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from envs.ant import corridor
 from envs.hands import hand_over
 from envs.physics import usable_cpus
+from envs.velocity import VARIANTS, robots
 
 from .cases import Build, Case, Program
 
@@ -59,7 +61,25 @@ def _hands_over(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
     return not data.qpos[hand_over.HINGES + 2] > hand_over.FALLEN
 
 
+def _velocity(name: str) -> Task:
+    """A robot of the velocity tasks; the humanoid's observation needs the forces after constraints, too."""
+    robot = robots.ROBOTS[name]
+
+    def reset(data: mujoco.MjData, rng: np.random.Generator) -> None:
+        data.qpos += rng.uniform(-robot.noise, robot.noise, len(data.qpos))
+        data.qvel[:] = robot.noise * rng.normal(size=len(data.qvel))
+
+    def over(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+        if robot.sees_forces:
+            mujoco.mj_rnePostConstraint(model, data)
+        healthy: Any = robot.healthy  # of NumPy's arrays here
+        return healthy is not None and not healthy(data.qpos, data.qvel)
+
+    return Task(robots.model(name), robot.substeps, reset, over)
+
+
 TASKS: dict[str, Callable[[], Task]] = {
+    **{f"velocity_{task}": functools.partial(_velocity, variant.robot) for task, variant in VARIANTS.items()},
     "ant_2x4": lambda: Task(corridor.model(), corridor.SUBSTEPS, _reset_ant, _ant_over),
     "hand_over_2x6": lambda: Task(hand_over.model(), hand_over.SUBSTEPS, _reset_hands, _hands_over),
 }

@@ -64,7 +64,7 @@ def _over(row: Row, rows: Rows, **reference: Any) -> float | None:
 
 
 def _of_plain(row: Row, rows: Rows) -> float | None:
-    ratio = _over(row, rows, kind="plain loop", threads=1)
+    ratio = _over(row, rows, kind="plain loop", task=row["task"], threads=1)
     threads = max((other["threads"] for other in matching(rows, kind="plain loop")), default=1)
     return ratio and ratio / threads
 
@@ -266,6 +266,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
     ),
     "hands": Table("hands", EVERY, (*SPEED, *CPU_SECONDS)),
+    "velocity": Table("velocity", EVERY, ("task", *SPEED)),
     "methods": Table(
         "methods",
         ("training",),

@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import mujoco
 
-Healthy = Callable[[jax.Array, jax.Array], jax.Array]  # qpos, qvel -> [] bool; False where anything is nan
+Healthy = Callable[[jax.Array, jax.Array], jax.Array]  # qpos, qvel (NumPy's too) -> [] bool; a nan is not healthy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,16 +55,17 @@ class Robot:
 
 
 def _ant_is_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    return jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all() & (qpos[2] >= 0.2) & (qpos[2] <= 1.0)
+    finite = (abs(qpos) < math.inf).all() & (abs(qvel) < math.inf).all()
+    return finite & (qpos[2] >= 0.2) & (qpos[2] <= 1.0)
 
 
 def _hopper_is_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    bounded = (jnp.abs(jnp.concatenate([qpos[2:], qvel])) < 100.0).all()
-    return bounded & (qpos[1] > 0.7) & (jnp.abs(qpos[2]) < 0.2)
+    bounded = (abs(qpos[2:]) < 100.0).all() & (abs(qvel) < 100.0).all()
+    return bounded & (qpos[1] > 0.7) & (abs(qpos[2]) < 0.2)
 
 
 def _walker_is_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    return (qpos[1] > 0.8) & (qpos[1] < 2.0) & (jnp.abs(qpos[2]) < 1.0)
+    return (qpos[1] > 0.8) & (qpos[1] < 2.0) & (abs(qpos[2]) < 1.0)
 
 
 def _humanoid_is_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:

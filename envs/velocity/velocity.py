@@ -48,7 +48,7 @@ FALL_LIMIT = 0.1  # of the second cost: falls per episode
 
 TOO_FAST = (0.86, 0.16, 0.12, 1.0)  # what a picture shows of a costly step: the robot and its bar in red
 BAR = {"free": (0.25, 0.62, 0.36, 1.0), "mark": (0.2, 0.22, 0.25, 1.0)}
-BAR_LENGTH, BAR_HEIGHT = 0.8, 0.9  # m: the bar at the threshold, and how far above the robot it floats
+BAR_LENGTH, BAR_HEIGHT = 0.8, 0.6  # m: the bar at the threshold, and how far above the robot's highest part it floats
 
 _BODIES = slice(None)
 _FORCES: Readout = {
@@ -219,13 +219,14 @@ class Velocity:
         del cost  # which of several costs it is of does not show in a sum
         share = float(raw["speed"]) / self.threshold
         moving = [g for g in scene.geoms[: scene.ngeom] if g.category == mujoco.mjtCatBit.mjCAT_DYNAMIC]
-        centre = np.mean([g.pos for g in moving], axis=0)
+        places = np.array([g.pos for g in moving])
+        centre = places.mean(0)
         for geom in scene.geoms[: scene.ngeom]:
             if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
                 geom.pos[:2] += 2 * np.round(centre[:2] / 2)
         for geom in moving if share > 1 else ():
             geom.rgba[:] = TOO_FAST
-        left = centre + (-BAR_LENGTH / 2, 0, BAR_HEIGHT)
+        left = np.array([centre[0] - BAR_LENGTH / 2, centre[1], places[:, 2].max() + BAR_HEIGHT])
         length = BAR_LENGTH * min(max(share, 0.01), 2.0)
         _add_box(scene, left + (length / 2, 0, 0), (length / 2, 0.03, 0.03), TOO_FAST if share > 1 else BAR["free"])
         _add_box(scene, left + (BAR_LENGTH, 0, 0), (0.01, 0.035, 0.07), BAR["mark"])

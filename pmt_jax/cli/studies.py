@@ -70,7 +70,7 @@ def _add_reproduce(commands: Any) -> None:
         "run what is missing for a table of the paper and print it: pmt reproduce table1",
         description="The same command continues where it was interrupted.",
     )
-    reproduce.add_argument("table", metavar="TABLE", help="table1 | table2 | table3 | fig4")
+    reproduce.add_argument("table", metavar="TABLE", help="table1 | table2 | table3 | fig4 | velocity")
     reproduce.add_argument(
         "--budget",
         default="smoke",

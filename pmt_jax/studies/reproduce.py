@@ -32,7 +32,8 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     for what, word, known in choices:
         if word not in known:
             raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
-    wanted, settings = paper["tables"][name], paper["budgets"][budget]
+    wanted = paper["tables"][name]
+    settings = {**paper["budgets"], **wanted.get("budgets", {})}[budget]
     absent = [task for task in wanted["tasks"] if task not in names()]
     if absent:
         raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")

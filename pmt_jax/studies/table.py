@@ -83,7 +83,8 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
         data |= {c.name: _estimate(row.scores[c.name], c) for c in shown(table) if c.name in row.scores}
         data |= {"within": float((row.beyond <= 0).mean()), "worst": _finite(cost.max())}
         data |= {"better": against and against.better, "p": against and against.p}
-        data["paper"] = {"table": given.get("table"), **given.get(row.method, {})}
+        reported = given.get(row.method, {})
+        data["paper"] = {"table": given.get("table"), "source": given.get("source"), "rerun": {}, **reported}
         result.append(data)
     return result
 
@@ -110,21 +111,22 @@ def _cells(
     table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str | None, test: bool
 ) -> tuple[list[str], list[list[str]]]:
     columns = [column.name for column in shown(table)]
-    papers = [column for column in columns if any(column in row["paper"] for row in data)]
+    reported = {"paper": [row["paper"] for row in data], "rerun": [row["paper"]["rerun"] for row in data]}
+    papers = [(who, column) for who in reported for column in columns if any(column in row for row in reported[who])]
     better = compare.names(compared(table)) if baseline else ()
     head = ["task", "method", "seeds", "steps", *columns, "limit", "seeds within", "worst seed"]
     head += [f"P({name})" for name in better] + [f"p ({name})" for name in better if test]
-    head += [f"paper {column}" for column in papers]
+    head += [f"{who} {column}" for who, column in papers]
     body = []
-    for row in data:
+    for i, row in enumerate(data):
         within = f"{round(row['within'] * row['seeds'])}/{row['seeds']}"
         line = [row["task"], f"{row['method']} {row['settings']}".strip(), str(row["seeds"]), f"{row['steps']:,}"]
         line += [_interval(row.get(column), "iqm") for column in columns]
         line += [f"{row['cost_limit']:g}", within, _number(row["worst"])]
         line += [_interval((row["better"] or {}).get(name), "probability") for name in better]
         line += [_number((row["p"] or {}).get(name), ".2g") for name in better if test]
-        given = (row["paper"].get(column) for column in papers)
-        body.append(line + ["{:.2f} ± {:.2f}".format(*x) if x else "-" for x in given])
+        given = (reported[who][i].get(column) for who, column in papers)
+        body.append(line + [" ± ".join(format(part, ".2f") for part in x) if x else "-" for x in given])
     return head, body
 
 
@@ -158,4 +160,11 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
     tables = sorted({f"{row['task']}: {row['paper']['table']}" for row in data if row["paper"]["table"]})
     if tables:
         notes.append(f"paper: mean ± standard deviation of 5 seeds, as far as known here ({', '.join(tables)}).")
+    notes += [f"{row['task']}, paper: {source}." for source, row in _sources(data).items()]
     return notes
+
+
+def _sources(data: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Where reported figures come from that are not the paper's own, each with the first row of a task that has it."""
+    rows = [row for row in data if row["paper"]["source"]]
+    return {row["paper"]["source"]: row for row in reversed(rows)}

@@ -105,6 +105,17 @@ def test_the_papers_numbers_stand_beside_ours_in_every_format(tmp_path: pathlib.
     assert r"ant\_2x4 & f4sg & 1 & " in latex and latex.rstrip().endswith(r"\end{tabular}")
 
 
+def test_reported_figures_of_others_come_with_their_provenance(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "a", "velocity_ant_2x4", "macpo", {0: [100, 1]})
+    made(tmp_path / "b", "velocity_half_cheetah_2x3", "mappo_l", {0: [100, 1]})
+    made(tmp_path / "c", "velocity_swimmer_2x1", "mappo_l", {0: [100, 1]})
+    text = cli("table", tmp_path)[1]
+    ant, cheetah, swimmer = text.splitlines()[2:5]
+    assert ant.split()[-4:] == ["1099.23", "3.39", "798.00", "10.50"]
+    assert cheetah.split()[-4:] == ["-", "-", "1141.00", "0.00"] and swimmer.split()[-4:] == ["-"] * 4
+    assert "rerun reward" in text and "velocity_ant_2x4, paper: second hand" in text and "not verified." in text
+
+
 def test_improvement_over_all_tasks_weighs_tasks_alike(tmp_path: pathlib.Path, cli):
     for task, reward in (("lane", 5), ("noisy", 1)):
         made(tmp_path / task / "base", task, "mappo_l", {0: [2, 1], 1: [3, 1]})

@@ -195,6 +195,27 @@ def test_resets_draw_what_the_tasks_say():
     np.testing.assert_allclose(np.asarray(physics.qvel).std(axis=0), 0.1, rtol=0.08)
 
 
+def test_a_picture_shows_speed_by_a_bar_and_too_much_of_it_in_red():
+    env = envs.make("velocity_half_cheetah_2x3")
+    data, scene = mujoco.MjData(env.model), mujoco.MjvScene(env.model, maxgeom=50)
+    data.qpos[0] = 57.3
+    mujoco.mj_forward(env.model, data)
+    drawn = []
+    for speed in (1.0, 4.0):
+        camera, every = mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(env.model, data, mujoco.MjvOption(), None, camera, every, scene)
+        env.decorate(scene, {"qpos": data.qpos, "speed": np.float32(speed)}, 0.0)
+        geoms = scene.geoms[: scene.ngeom]
+        bar = next(g for g in geoms if g.type == mujoco.mjtGeom.mjGEOM_BOX)
+        floor = next(g for g in geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE)
+        torso = next(g for g in geoms if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE)
+        drawn.append((float(bar.size[0]), torso.rgba[0] > 2 * torso.rgba[1]))
+        assert abs(floor.pos[0] - 57.3) <= 1 and floor.pos[0] % 2 == 0 and bar.pos[2] > torso.pos[2]
+    (short, tan), (long, red) = drawn
+    np.testing.assert_allclose(long / short, 4, rtol=1e-5)
+    assert red and not tan
+
+
 def test_standing_still_is_worth_1003_to_the_ant():
     env, *_ = made("velocity_ant_2x4")
     vector = VectorEnv(env, 4)
