@@ -180,7 +180,8 @@ def _guard(what: str, run: Callable[[], Any]) -> Any:
         return run()
     except (Exception, SystemExit) as error:  # a user's file may raise anything
         lines = traceback.extract_tb(error.__traceback__)
-        own = [line for line in lines if pathlib.Path(line.filename).parent != pathlib.Path(__file__).parent]
+        ours = (str(pathlib.Path(__file__).parent), "<")  # <string> is a dataclass
+        own = [line for line in lines if not line.filename.startswith(ours)]
         line = (own or lines)[-1]
         place = f"{pathlib.Path(line.filename).name}, line {line.lineno}"
         if isinstance(error, TaskError):

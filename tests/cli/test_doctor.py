@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 import tomllib
+from importlib import metadata
 
 import pytest
 
@@ -40,3 +43,18 @@ def test_optional_packages_are_those_of_the_extras():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for package, extra in doctor.EXTRAS.items():
         assert any(re.match(rf"{package}\b", line) for line in extras[extra]) or package == "warp-lang", package
+
+
+def test_what_is_imported_is_a_dependency_or_of_an_extra():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    stated = {name[0].lower() for line in project["dependencies"] if (name := re.match(r"[\w-]+", line))}
+    assert {"pillow", "matplotlib"} <= stated
+    trees = [ast.parse(file.read_text()) for folder in ("pmt_jax", "envs") for file in (ROOT / folder).rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    found |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level}
+    foreign = {name.split(".")[0] for name in found} - set(sys.stdlib_module_names) - {"pmt_jax", "envs"}
+    of = metadata.packages_distributions()
+    packages = {name: {p.lower().replace("_", "-") for p in of.get(name, [name])} for name in foreign}
+    extras = {name.lower() for name in doctor.EXTRAS} | {"pandapower", "pandas"}
+    assert not [name for name, of in packages.items() if not of & (stated | extras)]

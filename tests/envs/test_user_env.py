@@ -107,7 +107,7 @@ GOOD = EXAMPLE.read_text()
             "spec.cost_limit must be a number of at least 0, or a tuple of 1 of them, not -2",
         ),
         (GOOD.replace("horizon=50", "horizon=0"), "", "spec.horizon must be a whole number of at least 1, not 0"),
-        (GOOD.replace("horizon=50", "horizon=-3"), "", "spec.horizon must be a whole number of at least 1, not -3"),
+        (GOOD.replace("horizon=50", "horizon=-3"), "", "a whole number of at least 1, not -3 (env.py, line "),
         (GOOD.replace('name="pole"', 'name="../pole"'), "", "spec.name names folders: letters, digits"),
         (
             GOOD.replace('"tilt": jnp.abs(ends[0] - ends[1])', '"tilt": ends'),

@@ -53,6 +53,7 @@ def test_killed_and_out_of_disk(whole: pathlib.Path, disk: tuple[pathlib.Path, b
     kill(whole, STEPS, disk, times=2, seed=5)
 
 
+@pytest.mark.timeout(3600)  # on a loaded machine
 @pytest.mark.parametrize(
     "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(10)]
 )
