@@ -55,8 +55,9 @@ def evaluate_states(
     results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic, fresh))(state))
     if setup.overflow and np.any(results[setup.overflow] > 0):
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
+    limit = tuple(setup.limits.tolist()) if len(setup.limits) > 1 else setup.cost_limit
     return [
-        {"seed": setup.config.seed + i, "cost_limit": setup.cost_limit, "step": step, **figures}
+        {"seed": setup.config.seed + i, "cost_limit": limit, "step": step, **figures}
         for i, (figures, step) in enumerate(zip(seed_intervals(results), _steps(setup, state), strict=True))
     ]
 

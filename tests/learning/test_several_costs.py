@@ -83,3 +83,4 @@ def test_rows_and_evaluations_name_each_cost(task: str, tmp_path: pathlib.Path, 
     np.testing.assert_allclose(
         last["eval/episode_cost"], last["eval/episode_cost/0"] + last["eval/episode_cost/1"], rtol=1e-6
     )
+    assert "(cost limit 1, 0.5 an episode)" in cli("eval", out, "--episodes", 2, "--deterministic", "--trust")[1]
