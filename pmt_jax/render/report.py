@@ -150,8 +150,8 @@ def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
         return page.table(["policy", *heads], cells)
 
     return [
-        f"<h3>Evaluation</h3><p>{episodes} whole episode{'s' * (episodes > 1)} a seed from fixed starts, actions sampled or the mean; "
-        "mean and half-width of its 95 % interval.</p>",
+        f"<h3>Evaluation</h3><p>{episodes} whole episode{'s' * (episodes > 1)} a seed from fixed starts, actions "
+        "sampled or the mean; mean and half-width of its 95 % interval.</p>",
         listing(main),
         f"<details><summary>All metrics of the task</summary>{listing(others)}</details>" if others else "",
     ]
