@@ -205,3 +205,12 @@ def test_a_pipe_is_written_and_never_replaced(tmp_path: pathlib.Path):
     ):
         assert place == pathlib.Path("/dev/full")
         raise OSError(28, "No space left on device")
+
+
+def test_a_file_behind_o_is_whole_or_the_old_one(tmp_path: pathlib.Path):
+    out = tmp_path / "table.md"
+    out.write_text("old")
+    with pytest.raises(KeyboardInterrupt), writing(out) as partial:
+        partial.write_text("half")
+        raise KeyboardInterrupt
+    assert out.read_text() == "old" and [path.name for path in tmp_path.iterdir()] == ["table.md"]
