@@ -15,6 +15,7 @@ from ..errors import UsageError
 
 def answer(name: str, command: Callable[[], int]) -> int:
     """The exit code of `command`; a user's mistake gets one sentence that begins with the program's `name`, and 2."""
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # >&- closes
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what the terminal cannot show
     try:

@@ -6,10 +6,13 @@ import os
 import pathlib
 import shlex
 import stat
+import subprocess
+import sys
 
 import pytest
 
 from by_hand import row, written
+from places import ROOT
 from pmt_jax.errors import UsageError
 from pmt_jax.files import writing
 from pmt_jax.training import trainer
@@ -37,7 +40,7 @@ Train lane | unknown command 'Train'; did you mean 'train'?
 --verbose train lane | unknown argument '--verbose'
 train lane lane | unexpected word 'lane' (see pmt train --help)
 train 'lane ' | unknown task 'lane '; did you mean 'lane'?
-train LANE | unknown task 'LANE'; known: ant_2x4
+train LANE | unknown task 'LANE'
 train '' | unknown task ''
 train . | unknown task '.'
 train lane:Lane | unknown task 'lane:Lane'; did you mean 'lane'?
@@ -58,8 +61,8 @@ train empty.py | should hold one class with reset and step
 train syntax.py | cannot be imported: SyntaxError: invalid syntax
 train exits.py | cannot be imported: SystemExit: 0
 train lane --method | argument --method: expected one argument
-train lane --method= | unknown method ''; known: mappo
-train lane --method MAPPO | unknown method 'MAPPO'; known: mappo
+train lane --method= | unknown method ''
+train lane --method MAPPO | unknown method 'MAPPO'
 train lane --method mappo,happo | unknown method 'mappo,happo'; did you mean 'mappo'?
 train lane --seeds 0 | seeds must be at least 1 and fit 32 bits, not 0
 train lane --seeds 1e10 | seeds must be at least 1 and fit 32 bits, not 10000000000
@@ -94,7 +97,7 @@ train lane --env =3 | task 'lane' has no option ''
 train lane --env num_agents=0 | num_agents must be at least 1, not 0
 train lane --env num_agents=true | num_agents must be a whole number, not True
 train lane --env num_agents=100000 | needs at least 144,00
-train lane --preset= | unknown preset ''; known: default
+train lane --preset= | unknown preset ''
 train lane --preset ../presets/smoke | unknown preset '../presets/smoke'
 train --preset smoke | the following arguments are required: TASK|CONFIG
 train lane --eval-episodes 0 --eval-interval 1 | eval_episodes must be at least 1
@@ -131,7 +134,7 @@ eval run --episodes 99999999999 | --episodes must be a whole number of at most 2
 eval run --policy zero | unknown task 'run'
 eval lane --policy random --physics mujoco | --physics belongs to a run; leave out --policy
 eval voltage_33 --policy zero --env voltage=3 | task 'voltage_33' has no option 'voltage'
-eval hub: | unknown policy 'hub:'; known: hub:ant_2x4/f4sg
+eval hub: | unknown policy 'hub:'
 eval hub:../../etc/passwd | unknown policy 'hub:../../etc/passwd'
 eval hub:ant_2x4/r4sg --physics gpu | physics = 'gpu' does not fit
 export hub:ant_2x4/r4sg -o p --which best2 | unknown checkpoint 'best2'; did you mean 'best'?
@@ -150,13 +153,13 @@ plot run -o .png | cannot write .png: its ending must be .png, .svg or .pdf
 plot run -o file/x.png | cannot write file/x.png: File exists
 report run -o .html | cannot write .html: the ending of a report must be .html
 report broken | broken/metrics.jsonl: a row has step = "x", where a whole number belongs
-table run --baseline nobody | no row is called 'nobody'; known: mappo_l
+table run --baseline nobody | no row is called 'nobody'
 table run --test | --test compares with a baseline
 table run -o notrun | cannot write notrun: Is a directory
-table run --format pdf | unknown format 'pdf'; known: text
+table run --format pdf | unknown format 'pdf'
 reproduce table4 | unknown table 'table4'; did you mean 'table3'?
-reproduce table1 --budget huge | unknown budget 'huge'; known: paper, smoke
-reproduce table1 --format pdf | unknown format 'pdf'; known: text
+reproduce table1 --budget huge | unknown budget 'huge'
+reproduce table1 --format pdf | unknown format 'pdf'
 reproduce table1 table2 | unexpected word 'table2'
 hub ant | unexpected word 'ant'
 doctor --fix | unknown argument '--fix'
@@ -188,6 +191,14 @@ def test_each_gets_its_sentence(tmp_path: pathlib.Path, cli, monkeypatch: pytest
         if changed:
             wrong.append((words, "changed", changed))
     assert not wrong
+
+
+@pytest.mark.parametrize(("argv", "code"), [("envs", 0), ("nothing", 2)])
+def test_closed_output_is_silence(argv: str, code: int):
+    command = f"{shlex.quote(sys.executable)} -m pmt_jax {argv}"
+    silent = subprocess.run(["bash", "-c", f"{command} >&- 2>/dev/null"], cwd=ROOT, capture_output=True)
+    muted = subprocess.run(["bash", "-c", f"{command} 2>&- >&-"], cwd=ROOT, capture_output=True)
+    assert (silent.returncode, muted.returncode) == (code, code)
 
 
 def test_a_pipe_is_written_and_never_replaced(tmp_path: pathlib.Path):
