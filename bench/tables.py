@@ -70,7 +70,7 @@ def _of_plain(row: Row, rows: Rows) -> float | None:
 
 
 def _of_plain_per_cpu(row: Row, rows: Rows) -> float | None:
-    plain = matching(rows, kind="plain loop", threads=1)
+    plain = matching(rows, kind="plain loop", task=row["task"], threads=1)
     known = plain and "steps_per_cpu_second" in row and "steps_per_cpu_second" in plain[0]
     return row["steps_per_cpu_second"] / plain[0]["steps_per_cpu_second"] if known else None
 
@@ -266,7 +266,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
     ),
     "hands": Table("hands", EVERY, (*SPEED, *CPU_SECONDS)),
-    "velocity": Table("velocity", EVERY, ("task", *SPEED)),
+    "velocity": Table("velocity", EVERY, ("task", *SPEED, CPU_SECONDS[0])),
     "methods": Table(
         "methods",
         ("training",),
