@@ -81,6 +81,12 @@ class Hyper:
         "nan takes the task's own",
         Bound("be a cost per episode of at least 0 that fits 32 bits", lambda x: _is_limit(x)),
     )
+    cost_margin: float = constraint(
+        0.0,
+        "share of the limit that the learner keeps clear of: it holds costs to (1 - cost_margin) * cost_limit, and is "
+        "judged by cost_limit",
+        Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
+    )
     cost_seen: float = constraint(
         1.0,
         "probability that a costly step is felt by the learner; the task's own limit is scaled with it",
@@ -134,6 +140,9 @@ class Hyper:
     kappa: float = emotion(
         0.5, "the weight on the ratio stays within 1 +- kappa * clip; inf for no bound", NOT_NEGATIVE_OR_INF
     )
+    limit_lr: float = constraint(
+        0.0, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", NOT_NEGATIVE
+    )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", NOT_NEGATIVE_OR_INF)
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
     first_step: float = constraint(1.0, "first step of MACPO's line search, as a share of the full step", NOT_NEGATIVE)
@@ -183,6 +192,11 @@ class Config(Hyper):
         "episode",
         "estimate of the episode cost for the multiplier: mean of the episodes that finished in this update, the cost "
         "rate of this update's steps times the horizon, or the same of the cost critic's values",
+    )
+    lambda_unit: Literal["step", "limit"] = constraint(
+        "step",
+        "unit of the excesses that move the multiplier: cost per step, or the limit itself, cut at 1: an excess of a "
+        "tenth of the limit moves it alike at all limits and horizons",
     )
     lambda_rule: Literal["integral", "pid"] = constraint(
         "integral",

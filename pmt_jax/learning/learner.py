@@ -16,7 +16,7 @@ from .maths import lagrangian, running_moments
 from .maths.advantages import gae
 from .maths.losses import value_loss
 from .optimise import fit, init_train_state
-from .policy_update import policy_rows, update_policies
+from .policy_update import in_lambda_unit, policy_rows, update_policies
 from .rollout import flatten_steps
 from .setup import Setup, make_setup
 from .types import Batch, Critic, LearnerState, Metrics, Params, Tag
@@ -115,8 +115,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     # 5 Coping response: every agent's policy, and its multipliers.
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
-    limit = jnp.asarray(hyper.cost_limit)
-    cost_excess = lagrangian.cost_excess(episode_cost, limit, setup.vector.horizon)
+    cost_excess = _cost_excess(setup, hyper, episode_cost)
     weigh = functools.partial(_weight_of_cost, setup, hyper, state, cost_excess)
     rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
@@ -137,7 +136,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
         "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper)),
         "lambda": weigh(multiplier).mean(),
         "cost_excess": cost_excess.mean(),
-        "cost_beyond": jnp.maximum(episode_cost - limit, 0.0).sum(-1).mean(),
+        "cost_beyond": jnp.maximum(episode_cost - jnp.asarray(hyper.cost_limit), 0.0).sum(-1).mean(),
         **{f"critic/{k}": x for k, x in critic_metrics.items()},
         **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
         **{f"actor/{k}": x for k, x in actor_metrics.items()},
@@ -188,14 +187,21 @@ def _episode_cost(setup: Setup, hyper: Hyper, state: LearnerState, batch: Batch,
     return rollout.episode_cost_estimate(batch, state.episode_cost, setup.config.cost_estimate, horizon)
 
 
+def _cost_excess(setup: Setup, hyper: Hyper, episode_cost: jax.Array) -> jax.Array:
+    """How far an estimate [N, K] is beyond what the learner holds it to, in cost per step."""
+    held = jnp.asarray(hyper.cost_limit) * (1 - hyper.cost_margin)
+    return lagrangian.cost_excess(episode_cost, held, setup.vector.horizon)
+
+
 def _weight_of_cost(
     setup: Setup, hyper: Hyper, state: LearnerState, cost_excess: jax.Array, multiplier: jax.Array
 ) -> jax.Array:
     """What the policies weigh costs with [N, K]: the multiplier that a state carries, or the PID's sum with it."""
     if setup.config.lambda_rule == "integral" or setup.method.constraint != "lagrangian":
         return multiplier
-    previous = lagrangian.cost_excess(state.episode_cost, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
-    return lagrangian.pid(multiplier, cost_excess, previous, hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max)
+    excesses = (cost_excess, _cost_excess(setup, hyper, state.episode_cost))
+    now, before = (in_lambda_unit(setup, hyper, excess) for excess in excesses)
+    return lagrangian.pid(multiplier, now, before, hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max)
 
 
 ValueFn = Callable[[Params, jax.Array], jax.Array]

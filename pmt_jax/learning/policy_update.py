@@ -59,7 +59,8 @@ def policy_rows(
     scaled_cost = scaled if setup.config.cost_advantage == "std" else centred
     if setup.config.regret_response == "advantage":
         scaled_cost, log_weight = scaled_cost * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
-    hybrid = hybrid_advantage(advantage[..., None], scaled_cost, multiplier)
+    price = multiplier * (setup.method.constraint == "lagrangian")
+    hybrid = hybrid_advantage(advantage[..., None], scaled_cost, price)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
     rows = PolicyRows(
@@ -92,11 +93,11 @@ def _sequential(
     ) -> tuple[tuple[TrainState, jax.Array, jax.Array], Metrics]:
         actor, multiplier, factor = carry
         mine = dataclasses.replace(_select_agent(rows, i), factor=factor)
-        net, metrics = update_policy(
-            setup, hyper, _select_agent(actor, i), mine, cost_excess[i], jax.random.fold_in(tagged[Tag.ACTOR], i)
-        )
+        key = jax.random.fold_in(tagged[Tag.ACTOR], i)
+        excess = cost_excess[i] + multiplier[i]  # beyond a lowered limit; only a trust region asks for it
+        net, metrics = update_policy(setup, hyper, _select_agent(actor, i), mine, excess, key)
         log_ratio, metrics["kl_per_agent"] = _policy_change(setup, net.params, mine)
-        updated = _update_multiplier(setup, hyper, multiplier[i], mine, cost_excess[i], log_ratio)
+        updated = _update_multiplier(setup, hyper, multiplier[i], mine, cost_excess[i], log_ratio, metrics)
         actor = jax.tree.map(lambda all_, one: all_.at[i].set(one), actor, net)
         # The factor corrects the distribution of the executed joint action: no regret weight in it.
         return (actor, multiplier.at[i].set(updated), factor * jnp.exp(log_ratio)), metrics
@@ -120,13 +121,17 @@ def _simultaneous(
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
     per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), rows)
-    cost_excesses = cost_excess.reshape(actors, -1, cost_excess.shape[-1]).mean(1)
+    cost_excesses = (cost_excess + state.multiplier).reshape(actors, -1, cost_excess.shape[-1]).mean(1)
     one = jax.vmap(lambda *each: update_policy(setup, hyper, *each))
     actor, metrics = one(state.actor, per_actor, cost_excesses, keys)
-    params = jax.tree.map(lambda x: jnp.broadcast_to(x, (setup.nets.num_agents, *x.shape[1:])), actor.params)
+
+    def of_all(x: jax.Array) -> jax.Array:
+        return jnp.broadcast_to(x, (setup.nets.num_agents, *x.shape[1:]))
+
+    params = jax.tree.map(of_all, actor.params)
     log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: _policy_change(setup, *each))(params, rows)
     updated = jax.vmap(lambda *each: _update_multiplier(setup, hyper, *each))(
-        state.multiplier, rows, cost_excess, log_ratio
+        state.multiplier, rows, cost_excess, log_ratio, jax.tree.map(of_all, metrics)
     )
     return actor, updated, metrics
 
@@ -145,14 +150,30 @@ def _policy_change(setup: Setup, params: Params, rows: PolicyRows) -> tuple[jax.
 
 
 def _update_multiplier(
-    setup: Setup, hyper: Hyper, multiplier: jax.Array, rows: PolicyRows, cost_excess: jax.Array, log_ratio: jax.Array
+    setup: Setup,
+    hyper: Hyper,
+    multiplier: jax.Array,
+    rows: PolicyRows,
+    cost_excess: jax.Array,
+    log_ratio: jax.Array,
+    metrics: Metrics,
 ) -> jax.Array:
-    """One agent's multipliers [K], given how its policy has changed."""
-    if setup.method.constraint != "lagrangian":
+    """One agent's multipliers [K], or what its limits are lowered by, given how its policy has changed."""
+    if setup.method.constraint == "none":
         return multiplier
+    if setup.method.constraint == "trust_region":
+        return lagrangian.lowered_limit(multiplier, cost_excess, hyper.limit_lr, metrics["case"] == 0)
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
-    return lagrangian.dual_update(multiplier, cost_excess, surrogate, hyper.lambda_lr, hyper.lambda_max)
+    excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)
+    return lagrangian.dual_update(multiplier, excess, hyper.lambda_lr, hyper.lambda_max)
+
+
+def in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:
+    """An excess [..., K] in cost per step, in the unit that the multiplier's gains are for."""
+    if setup.config.lambda_unit == "step":
+        return excess
+    return lagrangian.in_limits(excess, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
 
 
 def update_policy(

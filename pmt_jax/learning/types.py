@@ -156,7 +156,8 @@ class LearnerState(ActingState):
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         that do not feel them.
-      multiplier: [N, K], lambda; with `lambda_rule = pid` its integral.
+      multiplier: [N, K], lambda; with `lambda_rule = pid` its integral; of MACPO what its limit is lowered by,
+        in cost per step.
       episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier is updated with.
       state_moments: [S], of raw states.
       rollout: environments and running sums.

@@ -55,7 +55,7 @@ METRICS: dict[str, Metric] = {
     "true_violation_rate": Metric("", "violation_rate of what the costs were"),
     "true_step_cost": Metric("cost", "step_cost of what the costs were"),
     "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
-    "lambda": Metric("", "the multiplier, mean over agents and costs; with `lambda_rule = pid` all three terms"),
+    "lambda": Metric("", "the multiplier, mean over agents and costs; of MACPO how far its limit is lowered, per step"),
     "cost_excess": Metric("cost per step", "how far the estimated episode cost is beyond its limit, over the horizon"),
     "cost_beyond": Metric("cost", "how far that estimate is beyond the limit, 0 within it; of several costs the sum"),
     "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),

@@ -47,6 +47,35 @@ def test_pid_weighs_costs_by_three_terms():
     )
 
 
+@pytest.mark.parametrize("method", ["mappo_l", "macpo"])
+def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
+    kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5)
+    lower, others = trained(method, cost_limit=1.0)
+    chex.assert_trees_all_equal(weights(kept)["actor"], weights(lower)["actor"])
+    assert shown["cost_excess"] == others["cost_excess"] and shown["cost_beyond"] < others["cost_beyond"]
+
+
+def test_macpo_keeps_to_the_limit_that_it_lowered():
+    made = program("macpo")
+    horizon, start = made.setup.vector.horizon, made.init(made.setup.hyper, jax.random.key(0))
+    lowered = dataclasses.replace(start, multiplier=jnp.full_like(start.multiplier, 2.0 / horizon))
+    after, metrics = made.step(made.hyper(cost_limit=12.0, limit_lr=0.25), lowered)
+    lower, _ = made.step(made.hyper(cost_limit=10.0), start)
+    chex.assert_trees_all_close(after.actor.params, lower.actor.params, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(after.multiplier, 2.0 / horizon + 0.25 * metrics["cost_excess"], rtol=1e-5)
+
+
+@pytest.mark.full
+def test_a_multiplier_in_units_of_the_limit_climbs_alike_below_every_limit():
+    made = program("mappo_l", lambda_unit="limit")
+    for limit in 1.0, 0.125:  # costs are more than twice as high at first
+        after, _ = made.step(
+            made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
+            made.init(made.setup.hyper, jax.random.key(0)),
+        )
+        np.testing.assert_allclose(after.multiplier, 0.78 + 0.25, rtol=1e-6)
+
+
 @pytest.mark.full
 def test_happo_and_mappo_are_the_same_with_one_agent():
     happo, mappo = (trained(method, env=(("num_agents", 1),))[0] for method in ("happo", "mappo"))

@@ -148,14 +148,29 @@ def test_dual_update(cost_advantage: list[float], expected: float):
     surrogate = jnp.mean(jnp.asarray([1.0, 2.0]) * jnp.asarray(cost_advantage))
     violation = lagrangian.cost_excess(jnp.asarray(30.0), 5.0, 100)
     np.testing.assert_allclose(
-        lagrangian.dual_update(jnp.asarray(0.78), violation, surrogate, 0.1, 20.0), expected, rtol=1e-6
+        lagrangian.dual_update(jnp.asarray(0.78), violation + surrogate, 0.1, 20.0), expected, rtol=1e-6
     )
 
 
 def test_dual_update_is_projected():
     violation = lagrangian.cost_excess(jnp.asarray(0.0), 50.0, 100)
-    assert lagrangian.dual_update(jnp.asarray(0.78), violation, jnp.asarray(0.0), 2.0, 20.0) == 0
-    assert lagrangian.dual_update(jnp.asarray(19.9), -violation, jnp.asarray(0.0), 2.0, 20.0) == 20
+    assert lagrangian.dual_update(jnp.asarray(0.78), violation, 2.0, 20.0) == 0
+    assert lagrangian.dual_update(jnp.asarray(19.9), -violation, 2.0, 20.0) == 20
+
+
+@pytest.mark.parametrize(("cost", "share"), [(0, -1), (1.5, -0.25), (2, 0), (3, 0.5), (4, 1), (90, 1)])
+def test_an_excess_as_a_share_of_the_limit(cost: float, share: float):
+    for scale in 1.0, 0.125:
+        excess = lagrangian.cost_excess(jnp.asarray(cost * scale), 2.0 * scale, 50)
+        np.testing.assert_allclose(lagrangian.in_limits(excess, 2.0 * scale, 50), share, rtol=1e-6)
+    assert lagrangian.in_limits(jnp.asarray([0.0, 0.5]), 0.0, 50).tolist() == [0, 1]  # nothing at all is allowed
+
+
+def test_a_limit_is_lowered_by_what_was_not_kept():
+    lowered = lagrangian.lowered_limit(jnp.asarray(0.5), jnp.asarray([2.0, -2.0, -9.0]), 0.125, jnp.asarray(False))
+    assert lowered.tolist() == [0.75, 0.25, 0]
+    lowered = lagrangian.lowered_limit(jnp.asarray(0.5), jnp.asarray([2.0, -2.0]), 0.125, jnp.asarray(True))
+    assert lowered.tolist() == [0.5, 0.25]
 
 
 def test_pid_adds_what_the_excess_is_and_how_it_rises():
@@ -173,8 +188,8 @@ def test_pid_does_not_wind_up(sign: int):
     """However long the excess lasted, one update of the other sign takes the multiplier off its bound."""
     excess, integral = jnp.asarray(0.5 * sign), jnp.asarray(1.0)
     for _ in range(1000):
-        integral = lagrangian.dual_update(integral, excess, jnp.asarray(0.0), 0.25, 2.0)
-    after = lagrangian.dual_update(integral, -excess, jnp.asarray(0.0), 0.25, 2.0)
+        integral = lagrangian.dual_update(integral, excess, 0.25, 2.0)
+    after = lagrangian.dual_update(integral, -excess, 0.25, 2.0)
     assert lagrangian.pid(after, -excess, excess, 1.0, 0.0, 2.0) == (2 - 0.125 - 0.5 if sign > 0 else 0.125 + 0.5)
 
 

@@ -15,6 +15,14 @@ def cost_excess(episode_cost: jax.Array, cost_limit: jax.Array | float, horizon:
     return (episode_cost - cost_limit) / horizon
 
 
+def in_limits(excess: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
+    """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
+
+    It asks for the same answer at every limit, and a cost far beyond one does not outrun the policy.
+    """
+    return jnp.clip(excess * horizon / jnp.maximum(cost_limit, 1e-6), -1.0, 1.0)
+
+
 def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: jax.Array) -> jax.Array:
     """The change in cost per step that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
 
@@ -29,17 +37,31 @@ def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: 
 
 def dual_update(
     multiplier: jax.Array,
-    cost_excess: jax.Array,
-    surrogate: jax.Array,
+    excess: jax.Array,
     lambda_lr: jax.Array | float,
     lambda_max: jax.Array | float,
 ) -> jax.Array:
-    """One projected gradient step of the multiplier: lambda <- clip(lambda + alpha (S + I), 0, lambda_max) (Eq. 17).
+    """One projected gradient step of the multiplier: lambda <- clip(lambda + alpha x, 0, lambda_max) (Eq. 17).
 
     Args:
-      multiplier: [...], lambda; violation: S [...] and surrogate: I [...], both in cost per step.
+      multiplier: [...], lambda; excess: [...], measured and expected, x = S + I in cost per step, or `in_limits`.
     """
-    return jnp.clip(multiplier + lambda_lr * (cost_excess + surrogate), 0.0, lambda_max)
+    return jnp.clip(multiplier + lambda_lr * excess, 0.0, lambda_max)
+
+
+def lowered_limit(
+    lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, helpless: jax.Array
+) -> jax.Array:
+    """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
+
+    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where the
+    step already does nothing but lower the cost, a limit lowered further would only have to be raised again later.
+
+    Args:
+      lowered: [...] so far, and cost_excess: S [...], in cost per step; helpless: [] or [...] bool, the step was such.
+    """
+    step = limit_lr * cost_excess
+    return jnp.maximum(lowered + jnp.where(helpless, jnp.minimum(step, 0.0), step), 0.0)
 
 
 def pid(
@@ -56,7 +78,7 @@ def pid(
     answers at once when the excess changes sign. A cost that falls adds nothing (Stooke et al., 2020, Algorithm 2).
 
     Args:
-      integral: I [...]; cost_excess, previous_excess: S [...] of this update and of the last, in cost per step.
+      integral: I [...]; cost_excess, previous_excess: S [...] of this update and of the last, in the same unit.
     """
     change = jnp.maximum(cost_excess - previous_excess, 0.0)
     return jnp.clip(integral + lambda_kp * cost_excess + lambda_kd * change, 0.0, lambda_max)
