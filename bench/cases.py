@@ -10,7 +10,7 @@ from pmt_jax import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.tasks import did_you_mean
 
-Kind = Literal["plain loop", "environment", "training", "start", "checkpoint", "power flow", "baseline"]
+Kind = Literal["plain loop", "environment", "training", "start", "checkpoint", "power flow", "baseline", "certificate"]
 Settings = tuple[tuple[str, Any], ...]
 
 
@@ -24,7 +24,7 @@ class Case:
       task: an environment, or a network for power flows.
       what: which start, tool, policy or walls.
       method, physics, solver: of training and of the engine; the task's own where left out.
-      seeds, num_envs: side by side; of power flows the batch, of a baseline its episodes.
+      seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
       settings: other settings of the training; alone, other options of the environment.
@@ -154,8 +154,7 @@ BENCHES = {
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
         (
             *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mujoco")),
-            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx", solver="fast")),
-            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx", solver="converged")),
+            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx")),
         ),
         _walled("solid", physics="mujoco"),
     ),
@@ -202,6 +201,11 @@ BENCHES = {
             for what in ("zero", "random", "droop", "opf")
         ),
         (Case("baseline", "voltage_33", "zero", num_envs=2),),
+    ),
+    "certificate": Bench(
+        "grids: in which steps of these 64 episodes any reactive power at all keeps every bus in the band",
+        tuple(Case("certificate", task, num_envs=64) for task in ("voltage_33", "voltage_141")),
+        (Case("certificate", "voltage_33", num_envs=2),),
     ),
     "checkpoint": Bench(
         "seconds to save and load a run of the method with the most networks; MB; share of training's wall time",

@@ -163,7 +163,12 @@ def training(case: Case) -> Build:
     return build
 
 
-ONCE = {"start": once.start, "checkpoint": once.checkpoint, "baseline": once.baseline}
+ONCE = {
+    "start": once.start,
+    "checkpoint": once.checkpoint,
+    "baseline": once.baseline,
+    "certificate": once.certificate,
+}
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 
 

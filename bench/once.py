@@ -1,4 +1,4 @@
-"""What is measured once and takes no turns: starts, checkpoints, and policies that are not learned."""
+"""What is measured once and takes no turns: starts, checkpoints, policies that are not learned, certificates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from pmt_jax import load_config, make_setup
+import envs
+from envs.voltage.certificate import certify
+from envs.voltage.control import VoltageControl
+from pmt_jax import load_config, make_setup, tasks
+from pmt_jax.learning.evaluation import EVALUATION_KEY
 from pmt_jax.policies.evaluate import evaluate_baseline
 from pmt_jax.training import run_folder, trainer
 from pmt_jax.training.checkpoint import Checkpoints
@@ -112,3 +116,43 @@ def baseline(case: Case) -> Row:
     """Means over episodes from the starts that `pmt eval` has."""
     found = evaluate_baseline(case.task, case.what, case.num_envs, {})
     return {name: round(float(x[0]), 6) for name, x in found.items() if isinstance(x, tuple)}
+
+
+def certificate(case: Case) -> Row:
+    """What dispatches can and cannot do in the steps of the episodes that `baseline` has.
+
+    `reached` are shares of steps with every bus in the band, under the best dispatch found; `possible` are those that
+    no proof excludes. The costs are of an episode, a step out of the band costing 1.
+    """
+    rows = _rows(case.task, case.num_envs)
+    with jax.enable_x64(True):
+        env = envs.make(case.task)
+        assert isinstance(env, VoltageControl)
+        found = certify(env, rows)
+    out = found.excess > 0
+    return {
+        "states": out.size,
+        "reached": round(1 - float(out.mean()), 6),
+        "possible": round(1 - float(found.impossible.mean()), 6),
+        "unknown": int((out & ~found.impossible).sum()),
+        "cost_reached": round(float(out.sum(axis=0).mean()), 6),
+        "cost_at_least": round(float(found.impossible.sum(axis=0).mean()), 6),
+        "largest_unknown_excess": round(float(np.max(found.excess, initial=0, where=out & ~found.impossible)), 6),
+        "largest_excess": round(float(found.excess.max()), 6),
+    }
+
+
+def _rows(task: str, episodes: int) -> np.ndarray:
+    """The data rows [T, episodes, D] that the episodes of evaluations step through, whatever the actions."""
+    vector = tasks.VectorEnv(tasks.make(task), episodes)
+    still = jax.numpy.zeros((episodes, vector.spec.num_agents, vector.spec.action_dim))
+
+    def step(state: tasks.VectorState, _: None) -> tuple[tasks.VectorState, tuple[jax.Array, jax.Array]]:
+        after, outcome = vector.step(state, still)
+        return after, (state.env.carry.row, outcome.terminated)
+
+    start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))  # as `play` has it
+    rows, ended = jax.jit(lambda: jax.lax.scan(step, start, length=vector.horizon)[1])()
+    if ended.any():
+        raise RuntimeError("without reactive power a power flow has no solution: the episode's later rows are unknown")
+    return np.asarray(rows, np.float64)

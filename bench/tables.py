@@ -188,6 +188,13 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "PL, MW": _shown("{:.3f}", "info/total_line_loss"),
     "reward": _shown("{:.2f}", "episode_reward"),
     "cost": _shown("{:.2f}", "episode_cost"),
+    "steps": _shown("{:,}", "states"),
+    "CR of the best dispatch found": _shown("{:.4f}", "reached"),
+    "no CR above": _shown("{:.4f}", "possible"),
+    "its cost": _shown("{:.2f}", "cost_reached"),
+    "no cost below": _shown("{:.2f}", "cost_at_least"),
+    "steps neither reached nor excluded": _shown("{}", "unknown"),
+    "their worst excess, p.u.": _shown("{:.4f}", "largest_unknown_excess"),
     "size, MB": _shown("{:.1f}", "checkpoint_mb"),
     "save, s": _shown("{:.2f}", "save_seconds"),
     "load, s": _shown("{:.2f}", "load_seconds"),
@@ -277,6 +284,14 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     ),
     "grid": Table("grid", ("environment",), ("task", "environments", "steps in a call", "environment steps/s")),
     "baselines": Table("baselines", ("baseline",), ("task", "what", "CR", "PL, MW", "reward", "cost")),
+    "certificate": Table(
+        "certificate",
+        ("certificate",),
+        (
+            *("task", "steps", "CR of the best dispatch found", "no CR above", "its cost", "no cost below"),
+            *("steps neither reached nor excluded", "their worst excess, p.u."),
+        ),
+    ),
     "checkpoint": Table(
         "checkpoint",
         ("checkpoint",),

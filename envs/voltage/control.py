@@ -345,7 +345,25 @@ class VoltageControl:
 
     def flow(self, state: State, action: jax.Array) -> PowerFlow:
         """The power flow that `step(state, action)` solves, differentiable in `action`."""
-        return self._solve(state.carry.row, self._reactive(state.carry.row, action))[0]
+        return self.flow_of(state.carry.row, action)
+
+    def flow_of(self, row: jax.Array, action: jax.Array) -> PowerFlow:
+        """The power flow of a data row [D] under `action` [N, 1]."""
+        return self._solve(row, self._reactive(row, action))[0]
+
+    def injections(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What buses inject in data rows [..., D]: MW; MVAr without the plants'; the most MVAr that plants add; [n, ...]."""
+        pv, p_load, q_load = np.split(rows, np.cumsum([self.num_agents, self.num_loads]), axis=-1)
+        most = self.scenario.action_scale * np.sqrt(np.maximum(np.asarray(self.s_max) ** 2 - pv**2, 0))
+        active, reactive, limit = np.zeros((3, self.scenario.network.n_bus, *rows.shape[:-1]))
+        for at, into, values in (
+            ("load_bus", active, -p_load),
+            ("load_bus", reactive, -q_load),
+            ("pv_bus", active, pv),
+            ("pv_bus", limit, most),
+        ):
+            np.add.at(into, self.scenario.table[at], np.moveaxis(values, -1, 0))
+        return active, reactive, limit
 
     def _solve(self, row: jax.Array, q: jax.Array) -> tuple[PowerFlow, jax.Array, jax.Array]:
         """The power flow of a row with reactive powers `q`, and what each bus then consumes, [n] MW and MVAr."""
