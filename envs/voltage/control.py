@@ -352,7 +352,7 @@ class VoltageControl:
         return self._solve(row, self._reactive(row, action))[0]
 
     def injections(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What buses inject in data rows [..., D]: MW; MVAr without the plants'; the most MVAr that plants add; [n, ...]."""
+        """MW, MVAr without the plants', and the most MVAr of plants, by bus [n, ...], of data rows [..., D]."""
         pv, p_load, q_load = np.split(rows, np.cumsum([self.num_agents, self.num_loads]), axis=-1)
         most = self.scenario.action_scale * np.sqrt(np.maximum(np.asarray(self.s_max) ** 2 - pv**2, 0))
         active, reactive, limit = np.zeros((3, self.scenario.network.n_bus, *rows.shape[:-1]))
