@@ -152,10 +152,7 @@ BENCHES = {
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
-        (
-            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mujoco")),
-            *(case for walls in ("reference", "solid") for case in _walled(walls, physics="mjx")),
-        ),
+        (*_walled("reference", physics="mujoco"), *_walled("solid", physics="mujoco")),
         _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(

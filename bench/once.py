@@ -124,7 +124,7 @@ def certificate(case: Case) -> Row:
     `reached` are shares of steps with every bus in the band, under the best dispatch found; `possible` are those that
     no proof excludes. The costs are of an episode, a step out of the band costing 1.
     """
-    rows = _rows(case.task, case.num_envs)
+    rows = data_rows(case.task, case.num_envs)
     with jax.enable_x64(True):
         env = envs.make(case.task)
         assert isinstance(env, VoltageControl)
@@ -142,7 +142,7 @@ def certificate(case: Case) -> Row:
     }
 
 
-def _rows(task: str, episodes: int) -> np.ndarray:
+def data_rows(task: str, episodes: int) -> np.ndarray:
     """The data rows [T, episodes, D] that the episodes of evaluations step through, whatever the actions."""
     vector = tasks.VectorEnv(tasks.make(task), episodes)
     still = jax.numpy.zeros((episodes, vector.spec.num_agents, vector.spec.action_dim))

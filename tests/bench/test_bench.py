@@ -11,10 +11,12 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
-from bench import compare, measure, records, render, runner, runs, tables
+import envs
+from bench import compare, measure, once, records, render, runner, runs, tables
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from docs.figures import ant_paths, curves
@@ -140,6 +142,17 @@ def test_quick_and_only_choose_cases(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         runner.measure("ant", tmp_path / "x.json", quick, threads=0, only=only, say=lambda _: None)
     assert seen[0] == (list(BENCHES["ant"].quick), measure.QUICK)
     assert [(case.kind, case.num_envs) for case in seen[1][0]] == [("training", 256)]
+
+
+@pytest.mark.full
+def test_certificates_are_of_the_episodes_that_policies_are_evaluated_in():
+    env: Any = envs.make("voltage_33")
+    rows = once.data_rows("voltage_33", 2)
+    voltages = jax.jit(lambda row: env.flow_of(row, np.zeros((6, 1), np.float32)).vm_pu)
+    off = np.array([abs(np.asarray(voltages(row)) - 1).max() for row in rows.reshape(-1, rows.shape[-1])])
+    zero = once.baseline(Case("baseline", "voltage_33", "zero", num_envs=2))
+    assert 0.5 < zero["info/totally_controllable_ratio"] < 1
+    assert np.mean(off <= 0.05) == pytest.approx(zero["info/totally_controllable_ratio"], abs=1e-5)
 
 
 def test_ratios_are_below_one_for_what_became_worse():
