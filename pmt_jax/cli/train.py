@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
+    from ..policies import warm_start
     from ..training import processes, trainer
 
     processes.join(arguments.coordinator, arguments.process, arguments.processes)
@@ -63,4 +64,5 @@ def run(arguments: argparse.Namespace) -> int:
         profile=arguments.profile,
         say=say,
         count=arguments.devices,
+        warm_start=warm_start.prepare,
     )

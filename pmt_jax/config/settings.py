@@ -169,6 +169,9 @@ class Config(Hyper):
     seed: int = common(
         0, "the first seed; the others count up from it. Runs are bitwise reproducible per seed, except with warp"
     )
+    init: str = common(
+        "", "a run folder or a pretrained policy; the run starts from its networks and running moments (empty: anew)"
+    )
     num_envs: int = sizes(64, "environments per seed, B", COUNT)
     rollout_length: int = sizes(64, "control steps of each environment between updates, T", COUNT)
     epochs: int = sizes(5, "passes over the batch per update, for actors and critics", COUNT)
@@ -225,6 +228,9 @@ class Config(Hyper):
         "letter",
         "what regret does to the ratio: as in the paper (its change weighs on it), one-sided (regret itself weakens "
         "what would repeat the action and strengthens what avoids it), or it weighs on the cost advantage instead",
+    )
+    init_fear: str = emotion(
+        "", "a run folder whose fear the run starts from, as a prior; agents of another team begin with its mean"
     )
     emotion_epochs: int = emotion(4, "passes over the batch for the fear and regret networks", COUNT)
     trust_steps: int = constraint(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from .. import tasks
 from ..config.settings import Config, Hyper
+from ..errors import UsageError
 from . import emotions, rollout
 from .maths import lagrangian, running_moments
 from .maths.advantages import gae
@@ -34,6 +35,9 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
     Returns:
       train: (key, hyper=the config's) -> (LearnerState, Metrics with a leading [updates]).
 
+    Raises:
+      UsageError: the settings cannot be used, or name a run to start from.
+
     Example:
       >>> from pmt_jax import load_config
       >>> train = make_train(load_config("lane", num_envs=8, steps=200, log_interval=1))
@@ -42,6 +46,8 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
       >>> metrics["violation_rate"].shape
       (2, 1)
     """
+    if config.init or config.init_fear:
+        raise UsageError("make_train starts anew; init and init_fear are for pmt train, which reads run folders")
     setup = make_setup(config, env)
 
     def train(key: jax.Array, hyper: Hyper = setup.hyper) -> tuple[LearnerState, Metrics]:

@@ -113,17 +113,18 @@ class Networks:
     def awaken_fear(self, params: Params, cost_rate: jax.Array) -> Params:
         """Starts fear at the observed `cost_rate` [N, K] where it has begun at nan; other weights stay as they are."""
         rate = jnp.clip(cost_rate, 1e-3, 1 - 1e-3)
-        bias: jax.Array = params["params"][self._fear_head]["bias"].reshape(rate.shape)
+        bias: jax.Array = params["params"][self.fear_head]["bias"].reshape(rate.shape)
         return self._with_fear_bias(params, jnp.where(jnp.isnan(bias), jnp.log(rate / (1 - rate)), bias))
 
     @property
-    def _fear_head(self) -> str:
+    def fear_head(self) -> str:
+        """The layer whose outputs are fear's logits."""
         return f"Dense_{len(self.fear_net.hidden)}"
 
     def _with_fear_bias(self, params: Params, bias: jax.Array) -> Params:
         layers = params["params"]
-        head = {**layers[self._fear_head], "bias": bias.ravel()}
-        return {**params, "params": {**layers, self._fear_head: head}}
+        head = {**layers[self.fear_head], "bias": bias.ravel()}
+        return {**params, "params": {**layers, self.fear_head: head}}
 
     def init_regret(self, key: jax.Array) -> Params:
         """Weights with a leading [num_agents]."""

@@ -20,6 +20,7 @@ from ..config.settings import HYPER_FIELDS, Config, differences, load_config, to
 from ..errors import UsageError
 from ..files import read_rows, writing
 from ..learning.setup import Trials, make_setup
+from ..policies import warm_start
 from ..training import trainer
 from ..training.checkpoint import Checkpoints
 from ..training.claims import claim
@@ -181,7 +182,8 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     )  # settings that are shared keep the last bits of a run
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
-    code = trainer.train(common, folder / "run", resume=begun, cache=cache, say=say, trials=trials, count=count)
+    how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare}
+    code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
     if code == 0:
         _cut(folder, group, out)
     return code

@@ -9,7 +9,7 @@ import os
 import pathlib
 import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -29,6 +29,7 @@ from .progress import Progress, duration
 from .signals import Interrupts
 
 CHECKPOINT_SECONDS = 300.0
+WarmStart = Callable[[Setup], Callable[[LearnerState], LearnerState] | None]
 MOST_REASONS = 5  # of seeds that broke, printed at the end
 
 
@@ -43,6 +44,7 @@ def train(
     say: Say = say,
     trials: Trials | None = None,
     count: int | None = None,
+    warm_start: WarmStart = lambda setup: None,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -55,6 +57,7 @@ def train(
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
       count: of devices to split the run over, of all processes together: one where None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
+      warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
@@ -73,12 +76,13 @@ def train(
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(make_setup(config), trials=trials, mesh=sharding.make_mesh(config, count))
         memory.check(setup)
+        begin = None if resume else warm_start(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say))
         _describe(setup, out, say)
         if cache:
             use_cache()
         state, programs = compile_run(setup, say)
-        trainer = Trainer(setup, programs, state, out, say)
+        trainer = Trainer(setup, programs, begin(state) if begin else state, out, say)
         try:
             trainer.open(stack, resume, loggers, profile)
             trainer.train(interrupts)

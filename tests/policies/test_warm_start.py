@@ -1,0 +1,101 @@
+"""A run that starts from what another has learned."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pmt_jax import load_config, make_train
+from pmt_jax.errors import UsageError
+from pmt_jax.learning import learner
+from pmt_jax.learning.setup import Setup, make_setup
+from pmt_jax.learning.types import LearnerState
+from pmt_jax.policies import load, warm_start
+from runs import ARGUMENTS, rows
+
+SIZES = {"num_envs": 4, "rollout_length": 25, "hidden": (8,), "minibatches": 1}
+
+
+def first(task: str = "lane", **changes: Any) -> tuple[Setup, LearnerState]:
+    """A run's setup and its first state."""
+    setup = make_setup(load_config(task, **({"method": "f4sg"} | SIZES | changes)))
+    hyper, keys, axes = setup.vmap_arguments
+    return setup, jax.vmap(lambda h, key: learner.init(setup, h, key), axes)(hyper, keys)
+
+
+def started(setup: Setup, state: LearnerState) -> LearnerState:
+    change = warm_start.prepare(setup)
+    assert change
+    return change(state)
+
+
+def test_networks_and_moments_are_the_other_runs_and_all_else_is_new(whole: pathlib.Path):
+    _, other = load.load_run(whole)
+    assert isinstance(other, LearnerState)
+    setup, fresh = first(seeds=3, init=str(whole))
+    state = started(setup, fresh)
+    turn = np.array([0, 1, 0])
+    for name in ("actor", "fear"):
+        learned, before, now = (getattr(x, name) for x in (other, fresh, state))
+        chex.assert_trees_all_equal(now.params, jax.tree.map(lambda x: x[turn], learned.params))
+        chex.assert_trees_all_equal(now.opt_state, before.opt_state)
+    chex.assert_trees_all_equal(state.critic.returns, jax.tree.map(lambda x: x[turn], other.critic.returns))
+    chex.assert_trees_all_equal(state.state_moments, jax.tree.map(lambda x: x[turn], other.state_moments))
+    for name in ("multiplier", "episode_cost", "rollout", "key", "update"):
+        chex.assert_trees_all_equal(getattr(state, name), getattr(fresh, name))
+
+
+def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
+    source, learned = first("ant_2x4", seed=5)
+    assert learned.fear
+    monkeypatch.setattr(warm_start, "load_run", lambda folder: (source, learned))
+    setup, fresh = first("ant_4x2", init_fear="another run")
+    state = started(setup, fresh)
+    assert state.fear
+    chex.assert_trees_all_equal((state.actor, state.critic.net), (fresh.actor, fresh.critic.net))
+    rows = jax.random.normal(jax.random.key(0), (5, source.vector.spec.state_dim))
+    two, four = (
+        nets.fear(jax.tree.map(lambda x: x[0], fear.params), rows)[..., 0]
+        for nets, fear in ((source.nets, learned.fear), (setup.nets, state.fear))
+    )
+    np.testing.assert_allclose(four, jnp.repeat(two.mean(-1, keepdims=True), 4, axis=-1), rtol=1e-4, atol=1e-5)
+
+
+def test_a_pretrained_policy_brings_what_acts():
+    setup, fresh = first("ant_2x4", hidden=(128, 128), init="hub:ant_2x4/f4sg")
+    state, (_, told) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))
+    chex.assert_trees_all_equal(state.actor.params, told.actor.params)
+    chex.assert_trees_all_equal(state.critic, fresh.critic)
+
+
+def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    out = tmp_path / "run"
+    assert cli("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)[0] == 0
+    assert load_config(out / "config.toml").init == str(whole)
+    assert rows(out)[0]["fear/loss"] != rows(whole)[0]["fear/loss"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"init": "nowhere"}, "nowhere is not a run folder"),
+        ({"init": "{whole}", "hidden": "16"}, "actor of {whole} has other shapes than this run's"),
+        ({"init_fear": "{whole}", "method": "mappo_l"}, "init_fear is for methods that fear"),
+        ({"init_fear": "hub:ant_2x4/f4sg"}, "hub:ant_2x4/f4sg has no fear network"),
+    ],
+)
+def test_mistakes(changes: dict[str, object], said: str, whole: pathlib.Path):
+    words: dict[str, Any] = {name: str(value).format(whole=whole) for name, value in changes.items()}
+    with pytest.raises(UsageError, match=said.format(whole=whole)):
+        warm_start.prepare(first(**words)[0])
+
+
+def test_pure_training_knows_no_folders():
+    with pytest.raises(UsageError, match="make_train"):
+        make_train(load_config("lane", init="hub:ant_2x4/f4sg"))
