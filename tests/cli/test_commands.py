@@ -76,6 +76,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
     assert len(list((out / "checkpoints").iterdir())) == 1
 
 
+@pytest.mark.full
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
     out = tmp_path / "broken"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", 2000, "--critic-lr", 1e38, "--out", out)

@@ -16,6 +16,7 @@ from pmt_jax.learning.types import Tag
 from small import acted, program, trained, weights
 
 
+@pytest.mark.full
 def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
     lagrangian, _ = trained("mappo_l", lambda_init=0.0, lambda_lr=0.0)
     chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
@@ -47,7 +48,7 @@ def test_pid_weighs_costs_by_three_terms():
     )
 
 
-@pytest.mark.parametrize("method", ["mappo_l", "macpo"])
+@pytest.mark.parametrize("method", ["mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
 def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
     kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5)
     lower, others = trained(method, cost_limit=1.0)

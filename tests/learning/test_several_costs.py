@@ -70,6 +70,7 @@ def test_a_policy_is_judged_by_the_cost_that_is_furthest_beyond_its_limit():
     assert judged_cost(row | {"cost_limit/0": 4.0, "cost_limit/1": 3.0}, "") == (-1.0, 0.0)
 
 
+@pytest.mark.full
 def test_rows_and_evaluations_name_each_cost(task: str, tmp_path: pathlib.Path, cli):
     out = tmp_path / "run"
     words = ["--num-envs", 4, "--rollout-length", 25, "--minibatches", 1, "--epochs", 1, "--hidden", 8, "--steps", 200]

@@ -113,6 +113,7 @@ def test_learning_rates_decay_beyond_two_to_the_31_steps():
     np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
 
 
+@pytest.mark.full
 def test_learning_rates_of_all_networks_halve_in_their_half_life():
     made = program("mixed")
     plain = made.setup.hyper

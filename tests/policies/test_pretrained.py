@@ -167,6 +167,7 @@ def test_packing_costs_no_reward_and_no_safety():
     assert np.mean(apart) <= 0.05
 
 
+@pytest.mark.full
 def test_a_trained_ant_runs_as_it_is_told():
     """Other episodes than the published ones, on the C engine: the two intervals meet."""
     [row] = evaluate.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")

@@ -30,6 +30,7 @@ def pole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return out
 
 
+@pytest.mark.full
 def test_an_own_task_is_a_page_of_its_metrics_and_actions(pole: pathlib.Path, tmp_path: pathlib.Path, cli):
     page = tmp_path / "pole.html"
     code, out, err = cli("render", pole, "-o", page, "--steps", "1:36")

@@ -54,6 +54,7 @@ def test_a_signal_while_it_compiles_ends_the_run_at_once(number: int, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_ctrl_c_twice_in_a_long_chunk_ends_the_run_at_once(tmp_path: pathlib.Path):
     process = busy("training", tmp_path)
     assert process.stdout

@@ -125,6 +125,7 @@ def test_the_table_of_robots_is_the_specifications():
         assert sorted(i for agent in partition for i in agent) == list(range(robots.model(robot).nu)), variant
 
 
+@pytest.mark.full
 def test_padding_of_unequal_agents_is_ignored():
     env, _, step = made("velocity_humanoid_9_8")
     assert env.spec.action_mask[0].all() and env.spec.action_mask[1].tolist() == [1] * 8 + [0]

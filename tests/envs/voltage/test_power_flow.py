@@ -145,6 +145,7 @@ def test_gradients_agree_with_finite_differences() -> None:
         np.testing.assert_allclose(tangent, gradient[17], rtol=1e-8)
 
 
+@pytest.mark.full
 def test_batches_of_batches_and_of_gradients() -> None:
     """More states than one group holds, below two vmaps, and gradients below one."""
     network = power_flow.load_network("case33")
