@@ -49,10 +49,6 @@ def kill(unbroken: pathlib.Path, steps: int, disk: tuple[pathlib.Path, bool], ti
         shutil.rmtree(out)
 
 
-def test_killed_and_out_of_disk(whole: pathlib.Path, disk: tuple[pathlib.Path, bool]):
-    kill(whole, STEPS, disk, times=2, seed=5)
-
-
 @pytest.mark.timeout(3600)  # on a loaded machine
 @pytest.mark.parametrize(
     "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(10)]
