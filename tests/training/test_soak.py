@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 import soak
-from runs import STEPS, assert_same_run
+from runs import assert_same_run
 
 LONG = 6000  # 30 rows, each with a checkpoint: two seconds
 
