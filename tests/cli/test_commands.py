@@ -88,6 +88,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
     assert rows(out)[-1]["step"] < 2000
 
 
+@pytest.mark.full
 def test_output_that_nobody_reads_any_more(whole: pathlib.Path):
     command = f"{sys.executable} -m pmt_jax eval {whole} --episodes 2 | true"
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}

@@ -15,7 +15,9 @@ from places import ROOT
 NEEDS = {"plain": set(), "scene": {"qpos"}, "map": {"vm_pu"}}  # of the quantities that a picture reads
 
 
-@pytest.mark.parametrize("name", envs.names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.full] if x == "voltage_141" else []) for x in envs.names()]
+)
 def test_declarations_name_what_is_there(name):
     env = envs.make(name)
     state = jax.eval_shape(env.reset, jax.random.key(0))

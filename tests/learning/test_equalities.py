@@ -136,6 +136,7 @@ def test_regret_stands_still_where_nothing_ever_costs():
     assert log_weight.any()
 
 
+@pytest.mark.full
 def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     setup, state, batch = acted()
     hyper = setup.hyper

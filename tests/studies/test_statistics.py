@@ -75,7 +75,7 @@ def test_intervals_cover_what_they_estimate_as_often_as_they_say(seeds: int, dra
         assert (0.86 if skewed_mean else 0.92) < covered < 0.985
 
 
-@pytest.mark.parametrize("seeds", [5, 20])
+@pytest.mark.parametrize("seeds", [5, pytest.param(20, marks=pytest.mark.full)])
 def test_the_interval_of_an_improvement_covers_it(seeds: int):
     rng = np.random.default_rng(0)
     for shift in (0.0, 1.0, 2.0):

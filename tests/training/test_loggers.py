@@ -17,6 +17,7 @@ from pmt_jax.training.progress import COLUMNS, Progress
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 
+@pytest.mark.full
 def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     pytest.importorskip("tensorboardX")
     out = tmp_path / "run"

@@ -44,7 +44,10 @@ def busy(phase: str, out: pathlib.Path) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, *(pytest.param(x, marks=pytest.mark.full) for x in (signal.SIGTERM, signal.SIGHUP))],
+)
 def test_a_signal_while_it_compiles_ends_the_run_at_once(number: int, tmp_path: pathlib.Path):
     process = busy("compiling", tmp_path)
     process.send_signal(number)

@@ -234,6 +234,7 @@ def holding():
     return jax.jit(lambda: jax.lax.scan(advance, vector.reset(jax.random.key(0)), None, length=75)[1])()
 
 
+@pytest.mark.full
 def test_still_half_flexed_hands_keep_the_egg_until_time_cuts_the_episode(holding):
     _, outcome = holding
     assert not outcome.terminated.any() and not outcome.truncated[:74].any() and outcome.truncated[74].all()

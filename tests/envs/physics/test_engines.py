@@ -113,6 +113,7 @@ def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(readout, tmp_p
     assert not list(tmp_path.iterdir()), "MuJoCo wrote its log into the working directory"
 
 
+@pytest.mark.full
 def test_large_batches_in_long_programs_do_not_deadlock():
     step = jax.vmap(jax.vmap(engine(threads=2).step))
     state, ctrl = jax.tree.map(lambda x: x.reshape(2, 1024, -1), starts(2048))
@@ -234,6 +235,7 @@ def test_forked_child_has_its_own_threads():
     assert done.stdout.strip().endswith("ok"), done.stderr
 
 
+@pytest.mark.full
 def test_interrupt_reaches_python_between_programs():
     done = run(
         ROLL

@@ -225,6 +225,7 @@ print("ok")
     "cpus",
     ["all", pytest.param("one", marks=pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux"))],
 )
+@pytest.mark.full
 def test_large_batches_among_matmuls_and_threads_do_not_deadlock(cpus):
     done = run(STRESS.format(cpus=cpus))
     assert done.stdout.strip() == "ok", done.stderr

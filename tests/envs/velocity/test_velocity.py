@@ -217,6 +217,7 @@ def test_a_picture_shows_speed_by_a_bar_and_too_much_of_it_in_red():
     assert red and not tan
 
 
+@pytest.mark.full
 def test_standing_still_is_worth_1003_to_the_ant():
     env, *_ = made("velocity_ant_2x4")
     vector = VectorEnv(env, 4)

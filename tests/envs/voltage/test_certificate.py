@@ -37,6 +37,7 @@ def forked_feeder(rng: np.random.Generator, rows: int) -> VoltageControl:
     return VoltageControl(Scenario("fork", network, table, action_scale=0.15), data=data, noise=False)
 
 
+@pytest.mark.full
 def test_verdicts_agree_with_brute_force():
     """What is proven impossible is, what brute force can do the dispatch does, and what misses by far is proven."""
     with jax.enable_x64(True):

@@ -38,7 +38,7 @@ def worst(ours: np.ndarray, theirs: np.ndarray) -> float:
     ("tag", "options", "dtype", "tolerance"),
     [
         ("full_nonoise", {}, "float64", 1e-7),
-        ("full_nonoise", {}, "float32", 1e-5),
+        pytest.param("full_nonoise", {}, "float32", 1e-5, marks=pytest.mark.full),
         ("bowl", {"barrier": "bowl"}, "float64", 1e-7),
         ("history3", {"history": 3}, "float32", 1e-5),
     ],
@@ -88,6 +88,7 @@ def test_specs_are_mapdns() -> None:
     assert (small.action_dim, small.num_costs, small.cost_limit) == (1, 1, 4.8)
 
 
+@pytest.mark.full
 def test_raw_is_the_inverse_of_restore_in_mid_episode_and_with_noise() -> None:
     env = folder_env(noise=True, history=2)
     step = jax.jit(env.step)
@@ -121,6 +122,7 @@ def test_state_structure_never_changes() -> None:
     assert described[0] == described[1] and not any(weak for _, _, weak in described[0])
 
 
+@pytest.mark.full
 def test_rows_come_as_in_mapdn_or_one_a_step() -> None:
     knots = folder_env().profiles.p_load
 
@@ -230,6 +232,7 @@ def test_reward_options_and_blocks() -> None:
     np.testing.assert_array_equal(first(few).global_state, np.r_[state.global_state[66:72], state.global_state[78:111]])
 
 
+@pytest.mark.full
 def test_profiles_in_the_package() -> None:
     for name, task in (("case33", "voltage_33"), ("case141", "voltage_141")):
         for data in ("simbench", "synthetic:3"):

@@ -127,6 +127,7 @@ def test_power_where_there_should_be_none_is_not_ignored() -> None:
     assert converged(np.stack([power, elsewhere])).tolist() == [True, False]
 
 
+@pytest.mark.full
 def test_gradients_agree_with_finite_differences() -> None:
     with jax.enable_x64(True):
         network = power_flow.load_network("case33")
