@@ -51,7 +51,7 @@ def kill(unbroken: pathlib.Path, steps: int, disk: tuple[pathlib.Path, bool], ti
 
 @pytest.mark.timeout(3600)  # on a loaded machine
 @pytest.mark.parametrize(
-    "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(10)]
+    "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(20)]
 )
-def test_killed_twenty_times(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
-    kill(unbroken, LONG, disk, times=20, seed=seed)
+def test_killed_ten_times(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
+    kill(unbroken, LONG, disk, times=10, seed=seed)
