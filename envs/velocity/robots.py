@@ -72,6 +72,17 @@ def _humanoid_is_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     return (qpos[2] > 1.0) & (qpos[2] < 2.0)
 
 
+_HOPPER = Robot(
+    substeps=4,
+    place="qpos",
+    axes=1,
+    speed="size",
+    control=1e-3,
+    noise=5e-3,
+    survival=1.0,
+    healthy=_hopper_is_healthy,
+    velocity_bound=10.0,
+)
 ROBOTS = {
     "ant": Robot(
         substeps=5,
@@ -86,28 +97,8 @@ ROBOTS = {
         unseen=2,
     ),
     "half_cheetah": Robot(substeps=5, place="qpos", axes=1, speed="size", control=0.1, noise=0.1, normal_velocity=True),
-    "hopper": Robot(
-        substeps=4,
-        place="qpos",
-        axes=1,
-        speed="size",
-        control=1e-3,
-        noise=5e-3,
-        survival=1.0,
-        healthy=_hopper_is_healthy,
-        velocity_bound=10.0,
-    ),
-    "walker2d": Robot(
-        substeps=4,
-        place="qpos",
-        axes=1,
-        speed="size",
-        control=1e-3,
-        noise=5e-3,
-        survival=1.0,
-        healthy=_walker_is_healthy,
-        velocity_bound=10.0,
-    ),
+    "hopper": _HOPPER,
+    "walker2d": dataclasses.replace(_HOPPER, healthy=_walker_is_healthy),
     "swimmer": Robot(substeps=4, place="qpos", axes=2, speed="signed", control=1e-4, noise=0.1, unseen=2),
     "humanoid": Robot(
         substeps=5,

@@ -33,6 +33,8 @@ def prepare(setup: Setup) -> Change | None:
       UsageError: there is no such run, its networks have other shapes, or one of the two methods has no fear.
     """
     config = setup.config
+    if not (config.init or config.init_fear):
+        return None
     hyper, keys, axes = setup.vmap_arguments
     like = jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), axes), hyper, keys)
     changes: dict[str, Any] = {}
@@ -40,8 +42,6 @@ def prepare(setup: Setup) -> Change | None:
         changes |= _networks(config.init, like)
     if config.init_fear:
         changes |= _fear(config.init_fear, like, setup)
-    if not changes:
-        return None
 
     def change(state: LearnerState) -> LearnerState:
         parts = {name: _with(getattr(state, name), learned) for name, learned in changes.items()}
