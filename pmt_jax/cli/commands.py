@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
+import pathlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import pmt_jax
 
+from ..config.methods import METHODS
+from ..errors import UsageError
+from ..tasks import did_you_mean
+from ..tasks import names as task_names
 from . import doctor, pictures, policies, studies, tasks, train
-from .parser import HELP, Parser, refuse_unknown
-from .process import answer
+from .parser import HELP, Parser, command, refuse_unknown
+from .process import answer, at_once
+
+SHELLS = ("bash", "zsh", "fish")
 
 
 def run(argv: Sequence[str] | None) -> int:
@@ -24,7 +33,37 @@ def make_parser() -> tuple[Parser, dict[str, Parser]]:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     for module in (train, policies, studies, pictures, tasks, doctor):
         module.add(commands)
+    completion = command(
+        commands,
+        "completion",
+        run_completion,
+        'complete commands with Tab: eval "$(pmt completion bash)"',
+        description="Prints a script that completes commands, flags, tasks and methods. bash and zsh evaluate it at their "
+        "start; fish reads it from ~/.config/fish/completions/pmt.fish.",
+    )
+    completion.add_argument("shell", metavar="SHELL", help=" | ".join(SHELLS))
     return parser, dict(commands.choices)
+
+
+@at_once()
+def run_completion(arguments: argparse.Namespace) -> int:
+    """Prints a shell's completion script."""
+    if arguments.shell not in SHELLS:
+        raise UsageError(f"unknown shell '{arguments.shell}'{did_you_mean(arguments.shell, SHELLS)}")
+    import shtab
+
+    parser, commands = make_parser()
+    words: dict[str, Any] = {"task": task_names(), "set_method": METHODS, "shell": SHELLS}
+    for name, each in commands.items():
+        for action in each._actions:
+            if action.dest == "source" and name in ("train", "sweep"):
+                action.choices = task_names()
+            elif action.dest in words:
+                action.choices = list(words[action.dest])
+            elif action.dest == "source" or action.type is pathlib.Path:
+                action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]
+    print(shtab.complete(parser, arguments.shell))
+    return 0
 
 
 def _run(argv: Sequence[str]) -> int:

@@ -12,6 +12,7 @@ import time
 
 import pytest
 
+from pmt_jax.cli.commands import SHELLS
 from runs import ARGUMENTS, STEPS, environment, rows
 
 
@@ -166,3 +167,13 @@ def test_another_package_named_envs_is_noticed(tmp_path: pathlib.Path):
     assert result.returncode == 2
     assert "another package named 'envs' stands in front of ours" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_completion_knows_tasks_methods_and_flags(shell: str, cli):
+    code, out, _ = cli("completion", shell)
+    assert code == 0 and all(word in out for word in ("hand_over_4x3", "f4sg", "lambda-lr", "sweep"))
+
+
+def test_completion_of_another_shell_is_refused(cli):
+    assert cli("completion", "tcsh")[::2] == (2, "pmt: unknown shell 'tcsh'; did you mean 'zsh'?\n")

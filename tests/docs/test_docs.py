@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+import pmt_jax
 from places import ROOT
 from pmt_jax.config.methods import METHODS
 
@@ -96,6 +97,11 @@ def test_python_in_markdown(path: pathlib.Path):
         program = compile("\n" * line + block[2], path, "exec")
         if not block[1]:
             exec(program, namespace)
+
+
+def test_the_citation_is_of_this_version():
+    assert f"\nversion: {pmt_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f'\nversion = "{pmt_jax.__version__}"\n' in (ROOT / "pyproject.toml").read_text()
 
 
 @pytest.mark.full
