@@ -38,8 +38,8 @@ def make_parser() -> tuple[Parser, dict[str, Parser]]:
         "completion",
         run_completion,
         'complete commands with Tab: eval "$(pmt completion bash)"',
-        description="Prints a script that completes commands, flags, tasks and methods. bash and zsh evaluate it at their "
-        "start; fish reads it from ~/.config/fish/completions/pmt.fish.",
+        description="Prints a script that completes commands, flags, tasks and methods. bash and zsh evaluate it when "
+        "they start; fish reads it from ~/.config/fish/completions/pmt.fish.",
     )
     completion.add_argument("shell", metavar="SHELL", help=" | ".join(SHELLS))
     return parser, dict(commands.choices)
