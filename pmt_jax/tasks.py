@@ -23,6 +23,7 @@ __all__ = [
     "VectorState",
     "absolute",
     "baseline",
+    "check",
     "columns",
     "declarations",
     "did_you_mean",
@@ -139,6 +140,19 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
             raise
         reason = (str(error).splitlines() or [""])[0]
         raise UsageError(f"task '{name}' cannot be built with {given}: {type(error).__name__}: {reason}") from error
+
+
+def check(env: Env) -> None:
+    """Checks the shapes of an environment that did not come from `make`.
+
+    Raises:
+      UsageError: it does not keep the contract of envs/base.py.
+    """
+    envs = _envs()
+    try:
+        envs.user.check_shapes(env, type(env).__name__)
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from error
 
 
 def options(name: str) -> dict[str, Any]:

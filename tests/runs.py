@@ -54,7 +54,7 @@ _compiled: dict[Any, tuple[LearnerState, Programs]] = {}
 def compile_once(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """`compile_run`, but runs of one process share programs that are the same."""
     config = setup.config
-    if setup.mesh or pathlib.Path(config.task).suffix:  # a file may have changed
+    if setup.mesh or setup.debug or pathlib.Path(config.task).suffix:  # a file may have changed
         return compile_run(setup, say)
     trials = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(vars(setup.trials) if setup.trials else None))
     key = (repr(config.replace(steps=10**9, init="", init_fear="")), repr(setup.method), trials)

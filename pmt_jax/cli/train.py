@@ -37,6 +37,9 @@ def add(commands: Any) -> None:
         help="metrics also go to any of csv, tensorboard, wandb",
     )
     output.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="JAX profiler trace of a few chunks")
+    output.add_argument(
+        "--debug", action="store_true", help="stop at the first number that is not finite and name its tensor; slower"
+    )
     add_cache(output)
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
@@ -65,4 +68,5 @@ def run(arguments: argparse.Namespace) -> int:
         say=say,
         count=arguments.devices,
         warm_start=warm_start.prepare,
+        debug=arguments.debug,
     )

@@ -13,6 +13,7 @@ from .. import tasks
 from ..config.settings import Config, Hyper
 from ..errors import UsageError
 from . import emotions, rollout
+from .debug import check_finite, watched
 from .maths import lagrangian, running_moments
 from .maths.advantages import gae
 from .maths.losses import value_loss
@@ -126,6 +127,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
 
+    computed = {"batch": batch, "fear": fear, "cost_signal": cost_signal, "regret": regret, "log_weight": log_weight}
+    computed |= {"advantage": advantage, "returns": returns, "cost_advantage": cost_advantage}
+    computed |= {"cost_returns": cost_returns, "critic": critic, "cost_critic": cost_critic}
+    check_finite(setup, state.update, **computed, actor=actor, multiplier=multiplier, episode_cost=episode_cost)
     state = dataclasses.replace(
         state,
         actor=actor,
@@ -170,7 +175,7 @@ def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.
         return tasks.felt_cost(cost, jax.random.fold_in(tagged[Tag.FELT], t), hyper.cost_seen, hyper.cost_false)
 
     after, batch, (obs, global_state) = rollout.collect(
-        setup.vector,
+        watched(setup, state.update),
         state.rollout,
         lambda obs: setup.nets.policies(state.actor.params, obs),
         normalisers,

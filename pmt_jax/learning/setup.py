@@ -36,7 +36,8 @@ class Setup:
     """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
 
     With `trials`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
-    With `mesh`, it is split over several devices (see devices.py).
+    With `mesh`, it is split over several devices (see sharding.py). With `debug`, its program checks that all it
+    computes is finite (see debug.py).
     """
 
     config: Config
@@ -45,6 +46,7 @@ class Setup:
     nets: networks.Networks
     trials: Trials | None = None
     mesh: jax.sharding.Mesh | None = None
+    debug: bool = False
 
     @property
     def limits(self) -> np.ndarray:
@@ -105,10 +107,13 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
       env: an environment of your own, in place of `config.task`.
 
     Raises:
-      UsageError: unknown task or task option, or an engine that cannot run here.
+      UsageError: unknown task or task option, an engine that cannot run here, or an `env` that breaks the contract.
     """
     method = METHODS[config.method]
-    env = env or tasks.make(config.task, config.physics, **dict(config.env))
+    if env is None:
+        env = tasks.make(config.task, config.physics, **dict(config.env))
+    else:
+        tasks.check(env)
     _check_limits(config, env.spec)
     nets = networks.build(config, env.spec, method.share_actor)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..learning import learner, sharding
+from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
 from ..learning.maths import running_moments
 from ..learning.setup import Setup
@@ -85,10 +85,8 @@ def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
 
     # The state is not donated: a seed that breaks returns to it.
     program = jax.jit(_over_seeds(setup, chunk, axes), out_shardings=(placement, everywhere))
-    with sharding.use_mesh(setup.mesh):
-        lowered = program.lower(hyper, state)
-    with cache_events() as events:
-        compiled = lowered.compile()
+    with sharding.use_mesh(setup.mesh), cache_events() as events:
+        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state).compile()
     evaluation = None
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
@@ -96,7 +94,8 @@ def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
         with sharding.use_mesh(setup.mesh):
             evaluation = program.lower(state).compile()
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
-    say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found})")
+    later = "; the first row compiles the checks of --debug" if setup.debug else ""
+    say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found}){later}")
     return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1))
 
 
@@ -125,7 +124,8 @@ def evaluate_seeds(
 
 
 def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callable[..., Any]:
-    return jax.vmap(function, axes, spmd_axis_name=sharding.SEED if setup.mesh else None)
+    axis_name = debug.SEEDS if setup.debug else None
+    return jax.vmap(function, axes, axis_name=axis_name, spmd_axis_name=sharding.SEED if setup.mesh else None)
 
 
 def _take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:

@@ -15,7 +15,9 @@ import jax
 import numpy as np
 
 from ..config.settings import Config
+from ..errors import UsageError
 from ..learning import sharding
+from ..learning.debug import NotFinite
 from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
@@ -45,6 +47,7 @@ def train(
     trials: Trials | None = None,
     count: int | None = None,
     warm_start: WarmStart = lambda setup: None,
+    debug: bool = False,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -58,10 +61,11 @@ def train(
       count: of devices to split the run over, of all processes together: one where None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
+      debug: stop at the first number that is not finite and name it; on one device.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
-      trial) broke or the folder could not be written any more.
+      trial) broke, `debug` found something or the folder could not be written any more.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
@@ -75,6 +79,9 @@ def train(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(make_setup(config), trials=trials, mesh=sharding.make_mesh(config, count))
+        if debug and setup.mesh:
+            raise UsageError("--debug runs on one device in one process; leave out --devices")
+        setup = dataclasses.replace(setup, debug=debug)
         memory.check(setup)
         begin = None if resume else warm_start(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say))
@@ -87,6 +94,9 @@ def train(
             trainer.open(stack, resume, loggers, profile)
             trainer.train(interrupts)
             stack.close()
+        except NotFinite as found:
+            say(f"stopped: {found}; saved as of step {trainer.step:,}")
+            return 1
         except OSError as error:
             with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
                 stack.close()
@@ -198,7 +208,11 @@ class Trainer:
         interrupts.save_first()
         while self.step < self.total and not self.all_broken and not self._agree_to_stop(interrupts):
             self._profile.before_chunk()
-            rows = self._train_chunk()
+            try:
+                rows = self._train_chunk()
+            except NotFinite:
+                self._save()
+                raise
             self._evaluate(rows)
             self.seconds = before + time.monotonic() - begin
             self._log(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
+import re
 import shutil
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from pmt_jax import load_config, make_setup
+from pmt_jax.learning.debug import SEEDS, NotFinite, check_finite, checked, watched
 from pmt_jax.training import health, trainer
 from pmt_jax.training.metrics import LOSSES
 from runs import ARGUMENTS, STEPS, rows, saved
@@ -124,3 +126,55 @@ def test_a_task_whose_reward_is_never_finite_stops(tmp_path: pathlib.Path, cli):
     code, text, err = cli("train", file, *sizes, "--steps", 1000, "--out", tmp_path / "run", "--no-cache")
     assert code == 1 and not err
     assert "stopped: 100% of the environment steps of seed 0 at step 100 were not finite; check the obs" in text
+
+
+DEBUG = {"num_envs": 2, "rollout_length": 25, "hidden": (4,), "minibatches": 1, "epochs": 1, "log_interval": 2}
+
+
+def test_debug_names_the_first_tensor_that_is_not_finite():
+    setup = dataclasses.replace(make_setup(load_config("lane", seed=5, **DEBUG)), debug=True)
+
+    def program(x: jax.Array) -> jax.Array:
+        batch = {"cost": jnp.arange(3), "obs": x, "reward": jnp.log(x - 2)}
+        check_finite(setup, jnp.int32(7), batch=batch, advantage=x / 0)
+        return x
+
+    run = checked(jax.jit(jax.vmap(program, axis_name=SEEDS)))
+    with pytest.raises(NotFinite, match=r"^batch\['reward'\] of seed 6 is not finite in update 7$"):
+        run(jnp.array([3.0, 1.0]))
+
+
+def test_debug_adds_nothing_where_it_is_off():
+    setup = make_setup(load_config("lane", **DEBUG))
+    traced = jax.make_jaxpr(lambda x: check_finite(setup, x, batch=x))(jnp.zeros(3))
+    assert not traced.eqns and watched(setup, jnp.zeros(())) is setup.vector
+
+
+@pytest.mark.full
+def test_debug_computes_the_same_run(whole, tmp_path, cli):
+    out = tmp_path / "run"
+    assert cli("train", *ARGUMENTS, "--steps", 400, "--debug", "--out", out)[0] == 0
+    assert rows(out) == [{**row, "seconds": mine["seconds"]} for row, mine in zip(rows(whole), rows(out), strict=False)]
+
+
+UNSOUND = """
+import dataclasses
+import jax.numpy as jnp
+from envs.toys import Lane
+
+class Unsound(Lane):
+    def step(self, state, action):
+        after = super().step(state, action)
+        return dataclasses.replace(after, reward=jnp.where(after.carry.position > 0.2, jnp.nan, after.reward))
+"""
+
+
+@pytest.mark.full
+def test_debug_looks_at_what_the_task_returns_and_saves_where_it_stopped(tmp_path, cli):
+    (tmp_path / "unsound.py").write_text(UNSOUND)
+    out, words = tmp_path / "run", (*ARGUMENTS[1:], "--method", "mappo", "--eval-interval", 0, "--debug")
+    code, said, _ = cli("train", tmp_path / "unsound.py:Unsound", *words, "--out", out)
+    assert code == 1 and re.search(
+        r"stopped: task\.step\.reward of seed [01] is not finite in update \d+; saved as", said
+    )
+    assert list((out / "checkpoints").iterdir())
