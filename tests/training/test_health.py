@@ -165,7 +165,7 @@ from envs.toys import Lane
 class Unsound(Lane):
     def step(self, state, action):
         after = super().step(state, action)
-        return dataclasses.replace(after, reward=jnp.where(after.carry.position > 0.2, jnp.nan, after.reward))
+        return dataclasses.replace(after, reward=jnp.where(after.carry.time > 9, jnp.nan, after.reward))
 """
 
 
