@@ -16,7 +16,7 @@ from pmt_jax.formats import markdown
 from pmt_jax.studies import plot, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
-from pmt_jax.studies.statistics import mean_interval
+from pmt_jax.studies.statistics import mean_interval, u_test
 
 from . import records
 
@@ -137,6 +137,44 @@ def as_summary(files: pathlib.Path) -> str:
     return markdown(["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)], body)
 
 
+def as_ran(files: pathlib.Path) -> str:
+    """What has run: a line a file of runs; a + joins the names of several files."""
+    head = (
+        "result",
+        "task",
+        "methods",
+        "seeds x steps",
+        "device",
+        "minutes",
+        "seeds with a multiplier within the limit",
+    )
+    body = []
+    for name in files.stem.split("+"):
+        found = load(files.with_stem(name))
+        held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
+        kept = [cost <= run["cost_limit"] for run in held for cost in run["table"]["cost"]]
+        first, steps = found[0], sorted({max(run["steps"]) for run in found})
+        span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
+        line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
+        line += [f"{len(first['seeds'])} x {span}", f"{first['versions']['device']}, `{first['versions']['engine']}`"]
+        body.append([*line, f"{max(run['seconds'] for run in found) / 60:.1f}", f"{sum(kept)} of {len(kept)}"])
+    return markdown(head, body)
+
+
+def as_pairs(file: pathlib.Path) -> str:
+    """Two-sided Mann-Whitney p of each pair of methods: above the diagonal of the reward, below it of the cost."""
+    found = in_order([_row(run) for run in load(file)])
+    body = []
+    for i, row in enumerate(found):
+        line = [
+            "" if i == j else f"{u_test(row.scores[of], other.scores[of]):.3f}".lstrip("0")
+            for j, other in enumerate(found)
+            for of in ("reward" if i < j else "cost",)
+        ]
+        body.append([f"`{row.method}`", *line])
+    return markdown(["", *(f"`{row.method}`" for row in found)], body)
+
+
 def _mean_std(mean: float, std: float) -> str:
     digits = 2 if abs(mean) >= 1 else 4
     return f"{mean:,.{digits}f} ± {std:,.{digits}f}"
@@ -166,4 +204,6 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "points": as_points,
     "paper": as_paper,
     "summary": as_summary,
+    "ran": as_ran,
+    "pairs": as_pairs,
 }

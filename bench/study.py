@@ -1,4 +1,4 @@
-"""The tables of docs/study.md: stored runs of seldom felt costs, read as the preregistration says."""
+"""The tables of docs/results/study.md: stored runs of seldom felt costs, read as the preregistration says."""
 
 from __future__ import annotations
 

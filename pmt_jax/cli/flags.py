@@ -67,10 +67,15 @@ class _Help(argparse.Action):
         parser.exit()
 
 
+def describe(field: dataclasses.Field[Any], config: Config) -> tuple[str, str]:
+    """Which values a setting takes, in words, and the one that it has in `config`, as one would type it."""
+    words = " | ".join(METHODS) if field.name == "method" else expectation(FIELDS[field.name])
+    return words, _shown(getattr(config, field.name))
+
+
 def _help(field: dataclasses.Field[Any], config: Config) -> str:
-    kind, value = FIELDS[field.name], getattr(config, field.name)
-    words = " | ".join(METHODS) if field.name == "method" else expectation(kind)
-    shown = f"default {_shown(value)}" if kind in _METAVARS else f"{words}; default {_shown(value)}"
+    words, default = describe(field, config)
+    shown = f"default {default}" if FIELDS[field.name] in _METAVARS else f"{words}; default {default}"
     return f"{field.metadata['help']} [{shown}]".replace("%", "%%")
 
 

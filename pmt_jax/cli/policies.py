@@ -105,7 +105,7 @@ def run_hub(arguments: argparse.Namespace) -> int:
     del arguments
     from ..policies import hub
 
-    say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/pretrained.md)")
+    say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
         facts = hub.about(name)

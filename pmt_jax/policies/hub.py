@@ -1,7 +1,7 @@
 """Trained policies that come with the package, one a task and method, under names like `hub:ant_2x4/r4sg`.
 
 Each is a small npz: the run's settings, what of its best seed's learner state acts, and the figures it was chosen by.
-Kernels are 8-bit integers with a scale per output, the rest is stored as it is: docs/pretrained.md says at what cost.
+Kernels are 8-bit integers with a scale per output, the rest is stored as it is: docs/howto/pretrained.md has the error.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def file_of(name: str) -> pathlib.Path:
 
 
 def about(name: str) -> dict[str, Any]:
-    """What is known of a policy: its figures, where it comes from, what packing cost (see docs/pretrained.md).
+    """What is known of a policy: its figures, where it comes from, what packing cost (see docs/howto/pretrained.md).
 
     Raises:
       UsageError: there is no such policy.

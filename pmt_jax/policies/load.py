@@ -65,7 +65,7 @@ def load_run(
 
     Args:
       folder: the run folder, or the name of a pretrained policy, of which there is but what acts of one seed.
-      which: `last`, or `best`: each seed's own best (see docs/runs.md).
+      which: `last`, or `best`: each seed's own best (see docs/howto/evaluate.md).
       physics: an engine other than the run's.
       warn: called with a sentence for each damaged checkpoint, which is passed over.
 
@@ -89,7 +89,7 @@ def load_policy(
     Args:
       folder: the run folder, which is only read, or the name of a pretrained policy: `hub:ant_2x4/r4sg`.
       seed: one of the run's seeds; its first if None.
-      which: `last`, or `best`: the seed's own best (see docs/runs.md).
+      which: `last`, or `best`: the seed's own best (see docs/howto/evaluate.md).
       trust: execute the task's Python file even if it comes from elsewhere.
 
     Returns:

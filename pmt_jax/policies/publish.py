@@ -2,7 +2,7 @@
 
 `python -m bench publish RUN...` does so in a checkout. All figures are means over whole episodes under mean actions;
 those that are told are from other starts than those by which the policy was chosen. A policy is better by the rule that
-`best` checkpoints are kept by (docs/runs.md); for methods without a constraint reward alone counts.
+`best` checkpoints are kept by (docs/howto/evaluate.md); for methods without a constraint reward alone counts.
 """
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from .. import formats
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
 
@@ -108,16 +107,6 @@ def describe(name: str) -> Metric:
     if name.startswith("info/"):
         return Metric("", f"the task's own `{name.removeprefix('info/')}`, mean per control step")
     return METRICS[re.sub(r"/\d+$", "", name)]
-
-
-def table() -> str:
-    """All columns as a Markdown table; those of `cost_critic/` are as those of `critic/`."""
-    shown = {name: metric for name, metric in METRICS.items() if not name.startswith("cost_critic/")}
-    sums = {"sum": "; summed over the row"}
-    rows = [[f"`{name}`", m.unit, m.definition + sums.get(m.reduction, "")] for name, m in shown.items()]
-    return formats.markdown(
-        ["metric", "unit", "meaning"], rows, ["`cost_critic/` has the columns of `critic/`, in costs."]
-    )
 
 
 def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> list[Row]:

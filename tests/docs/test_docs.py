@@ -13,6 +13,7 @@ import importlib
 import json
 import pathlib
 import re
+import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,19 +21,42 @@ import pytest
 
 import pmt_jax
 from places import ROOT
+from pmt_jax import tasks
+from pmt_jax.cli import flags
+from pmt_jax.cli.commands import make_parser
+from pmt_jax.cli.parser import refuse_unknown
 from pmt_jax.config.methods import METHODS
+from pmt_jax.config.settings import load_config
 
-MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```python\n(.*?)```", re.DOTALL)
 # Examples that compile for several seconds; what they show is tested elsewhere too.
 SLOW = {"pmt_jax.learning.learner", "envs.voltage.control", "envs.voltage.baselines", "envs.voltage.power_flow"}
+# Pages whose examples train.
+TRAINING = {"evaluate", "own_loop", "own_method", "own_task"}
+
+
+def pages(what: str, slow: frozenset[str] | set[str] = frozenset()) -> list[Any]:
+    """The pages that have `what`; those of the stems in `slow` are tested in .ci/run's second part."""
+    found = [path for path in MARKDOWN if what in path.read_text()]
+    marks = {True: [pytest.mark.full], False: []}
+    return [pytest.param(x, id=str(x.relative_to(ROOT)), marks=marks[x.stem in slow]) for x in found]
+
+
+def commands(path: pathlib.Path) -> list[list[str]]:
+    """The words after `pmt` of each command in a page's shell blocks."""
+    blocks = re.findall(r"```bash\n(.*?)```", path.read_text().replace("\\\n", " "), re.DOTALL)
+    lines = re.sub(r"\$\(.*?\)", "", "\n".join(blocks)).splitlines()
+    words = [shlex.split(part, comments=True) for line in lines for part in re.split(r"&&|[|;]", line)]
+    return [each[each.index("pmt") + 1 :] for each in words if "pmt" in each]
 
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
-    """Examples may write files and add methods."""
+    """Examples may write files and add methods; they find the repository's docs where a reader does."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
     before = dict(METHODS)
     yield
     METHODS.clear()
@@ -85,7 +109,7 @@ def test_examples_in_docstrings(path: pathlib.Path):
     assert result.attempted and not result.failed
 
 
-@pytest.mark.parametrize("path", MARKDOWN, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", pages("```python", TRAINING))
 def test_python_in_markdown(path: pathlib.Path):
     """A file's blocks run in order, in one namespace."""
     text = path.read_text()
@@ -119,3 +143,26 @@ def test_the_tutorial(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     assert not (namespace["dreaded"]["lambda"] == namespace["metrics"]["lambda"]).all()  # another method, indeed
     said = capsys.readouterr().out
     assert "episode_reward" in said and "dread" in said and "tilt" in said
+
+
+@pytest.mark.parametrize("path", pages("pmt "))
+def test_commands_in_markdown(path: pathlib.Path):
+    """Each command is one that the parser takes, with settings that its task takes."""
+    for words in commands(path):
+        parser, known = make_parser()
+        refuse_unknown(words, known)
+        arguments = parser.parse_all([word for word in words if word != "--help"])
+        source = getattr(arguments, "source", "")
+        if arguments.command == "train" and source.removeprefix("paper/") in tasks.names():
+            load_config(source, preset=arguments.preset, **flags.given(arguments))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("page", ["install", "first_run"])
+def test_the_start_pages_run(page: str, cli: Any):
+    """Command after command, with fewer steps and episodes than the page has."""
+    ran = commands(ROOT / "docs" / "start" / f"{page}.md")
+    for words in ran:
+        short = re.sub(r"--steps \S+", "--steps 8192", re.sub(r"--episodes \S+", "--episodes 2", " ".join(words)))
+        assert cli(*short.split())[0] == 0, short
+    assert ran

@@ -11,7 +11,6 @@ import types
 import pytest
 from rich.console import Console
 
-from places import ROOT
 from pmt_jax.training import metrics
 from pmt_jax.training.progress import COLUMNS, Progress
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
@@ -70,11 +69,6 @@ def test_every_column_is_defined(whole: pathlib.Path):
     assert metrics.describe("episode_cost/0") == metrics.describe("episode_cost")
     with pytest.raises(KeyError):
         metrics.describe("figure")
-
-
-def test_the_documentation_has_the_table():
-    text = (ROOT / "docs" / "runs.md").read_text()
-    assert text.split("<!-- metrics -->\n")[1].split("\n<!-- /metrics -->")[0] == metrics.table()
 
 
 def shown(width: int | None) -> str:
