@@ -30,6 +30,14 @@ def add(commands: Any) -> None:
     add_deterministic(evaluation)
     add_which(evaluation)
     add_trust(evaluation)
+    evaluation.add_argument(
+        "--save",
+        type=pathlib.Path,
+        metavar="FILE.npz",
+        help="also write every step: seed [S], length [S, E], obs [S, E, T, N, O], action [S, E, T, N, A], reward "
+        "[S, E, T], cost and true_cost [S, E, T, N, K], terminated, truncated and info/NAME [S, E, T] of S seeds, E "
+        "episodes, T steps, N agents; 0 from an episode's length on",
+    )
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 
     export = command(
@@ -61,12 +69,13 @@ def run_eval(arguments: argparse.Namespace) -> int:
     episodes = arguments.episodes
     if arguments.policy:
         options = dict(convert("env", arguments.env or ()))
-        rows = [evaluate.evaluate_baseline(arguments.source, arguments.policy, episodes, options)]
+        rows = [evaluate.evaluate_baseline(arguments.source, arguments.policy, episodes, options, arguments.save)]
         how = f"policy {arguments.policy}"
     else:
         run, which = pathlib.Path(arguments.source), arguments.which or "last"
         with trusting(arguments.trust):
-            rows = evaluate.evaluate_run(run, episodes, arguments.deterministic, which, arguments.physics, say=say)
+            chosen = (arguments.deterministic, which, arguments.physics)
+            rows = evaluate.evaluate_run(run, episodes, *chosen, say=say, save=arguments.save)
         how = f"{'mean' if arguments.deterministic else 'sampled'} actions"
         how += " of the best policy" if which == "best" else ""
     shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
@@ -74,6 +83,8 @@ def run_eval(arguments: argparse.Namespace) -> int:
     say(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
         _say_row(row)
+    if arguments.save:
+        say(f"wrote every step to {arguments.save}")
     return 0
 
 

@@ -20,6 +20,7 @@ from .types import ActingState, Hyper, Metrics, Tag
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
 FRESH_KEY = EVALUATION_KEY + 1  # of starts by which no policy was chosen
+STEP = "step/"  # before the names of what `play` records of every step
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
 
@@ -32,6 +33,7 @@ def evaluate(
     deterministic: bool,
     fresh: bool = False,
     hyper: Hyper | None = None,
+    record: bool = False,
 ) -> Metrics:
     """Runs one seed's policy for `episodes` whole episodes.
 
@@ -42,6 +44,7 @@ def evaluate(
       deterministic: take the mean action instead of a sample.
       fresh: from starts, and with noise, other than those that training and `publish` choose by.
       hyper: says what of the costs is felt; the setup's own if None.
+      record: also return every step, as in `play`.
 
     Returns:
       The metrics of `play`, and within_limit [episodes]: whether an episode's cost (the true one, of several each felt
@@ -59,7 +62,7 @@ def evaluate(
         step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
         return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
 
-    metrics = play(setup.vector.env, act, episodes, feel, fresh)
+    metrics = play(setup.vector.env, act, episodes, feel, fresh, record)
     count = setup.vector.spec.num_costs
     names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
     costs = jnp.stack([metrics[name] for name in names], axis=-1)
@@ -67,18 +70,27 @@ def evaluate(
     return metrics | {"within_limit": within.astype(costs.dtype)}
 
 
-def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: cost, fresh: bool = False) -> Metrics:
+def play(
+    env: tasks.Env,
+    act: Act,
+    episodes: int,
+    feel: Feel = lambda cost, t: cost,
+    fresh: bool = False,
+    record: bool = False,
+) -> Metrics:
     """`episodes` whole episodes of any policy, from starts that are always the same.
 
     Args:
       feel: what of a step's cost the team notices; all of it by default.
       fresh: as in `evaluate`.
+      record: also return every step.
 
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
       what the costs were before `feel`), episode_cost/k of each of several costs, and the task's info (means over the
-      episode), each [episodes]; all undiscounted.
+      episode), each [episodes]; all undiscounted. With `record` also `step/NAME` [horizon, episodes, ...]: obs (before
+      the action), action, reward, cost as felt, true_cost, terminated, truncated, info/NAME; 0 after an episode's end.
     """
     vector = tasks.VectorEnv(env, episodes)
     mask = jnp.asarray(vector.spec.action_mask)
@@ -87,9 +99,10 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
 
     def step(
         carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array
-    ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], None]:
+    ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], Metrics]:
         state, alive, sums = carry
-        state, outcome = step_per_device(state, act(state.env, t) * mask)
+        seen, action = state.env.obs, act(state.env, t) * mask
+        state, outcome = step_per_device(state, action)
         each = feel(outcome.cost, t)
         cost, true_cost = each.sum(-1), outcome.cost.sum(-1)
         now = {
@@ -103,7 +116,8 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
         sums = {name: sums[name] + alive * now[name] for name in sums}
-        return (state, alive & ~(outcome.terminated | outcome.truncated), sums), None
+        kept = _recorded(seen, action, each, outcome, alive) if record else {}
+        return (state, alive & ~(outcome.terminated | outcome.truncated), sums), kept
 
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
     start = vector.reset(jax.random.fold_in(key, vector.horizon))
@@ -113,9 +127,30 @@ def play(env: tasks.Env, act: Act, episodes: int, feel: Feel = lambda cost, t: c
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
     carry = (start, jnp.ones(episodes, bool), sums)
-    (_, _, sums), _ = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
+    (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
     per_step = [name for name in sums if not name.removeprefix("true_").startswith("episode_")]
-    return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}}
+    return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
+
+
+def _recorded(
+    obs: jax.Array, action: jax.Array, felt: jax.Array, outcome: tasks.Outcome, alive: jax.Array
+) -> dict[str, jax.Array]:
+    """What `play` keeps of one step of all environments, 0 where an episode has ended."""
+    kept = {
+        "obs": obs,
+        "action": action,
+        "reward": outcome.reward,
+        "cost": felt,
+        "true_cost": outcome.cost,
+        "terminated": outcome.terminated,
+        "truncated": outcome.truncated,
+        **{f"info/{name}": x for name, x in outcome.info.items()},
+    }
+
+    def masked(x: jax.Array) -> jax.Array:
+        return jnp.where(alive.reshape(alive.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
+
+    return {f"{STEP}{name}": masked(x) for name, x in kept.items()}
 
 
 def interval(x: np.ndarray) -> tuple[float, float]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from .. import tasks
 from ..errors import UsageError
-from ..learning.evaluation import interval, play
+from ..files import writing
+from ..learning.evaluation import STEP, interval, play
 from ..learning.setup import Setup
 from ..learning.types import ActingState
 from ..training.compile import evaluate_seeds
@@ -28,6 +29,7 @@ def evaluate_run(
     which: str = "last",
     physics: str | None = None,
     say: Say = print,
+    save: pathlib.Path | None = None,
 ) -> list[dict[str, Any]]:
     """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
 
@@ -38,13 +40,23 @@ def evaluate_run(
       deterministic: take mean actions instead of samples.
       which: `last` or `best`.
       physics: an engine other than the run's.
+      save: an .npz file for every step of every episode (docs/runs.md lists its arrays).
+
+    Raises:
+      UsageError: there is no such run, the physics lost contacts, or `save` cannot be written.
     """
+    _check_ending(save)
     chosen = which == "best" or hub.is_name(out)
-    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic, fresh=chosen)
+    return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic, fresh=chosen, save=save)
 
 
 def evaluate_states(
-    setup: Setup, state: ActingState, episodes: int, deterministic: bool, fresh: bool
+    setup: Setup,
+    state: ActingState,
+    episodes: int,
+    deterministic: bool,
+    fresh: bool,
+    save: pathlib.Path | None = None,
 ) -> list[dict[str, Any]]:
     """The rows of `evaluate_run` for learner states with a leading [seeds], or what of them acts.
 
@@ -52,9 +64,12 @@ def evaluate_states(
       fresh: from starts other than those that training and `publish` choose by.
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    results = jax.device_get(jax.jit(evaluate_seeds(setup, episodes, deterministic, fresh))(state))
+    program = evaluate_seeds(setup, episodes, deterministic, fresh, record=save is not None)
+    results = jax.device_get(jax.jit(program)(state))
     if setup.overflow and np.any(results[setup.overflow] > 0):
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
+    if save:
+        results = _save_steps(save, results, setup.config.seed)
     limit = tuple(setup.limits.tolist()) if len(setup.limits) > 1 else setup.cost_limit
     return [
         {"seed": setup.config.seed + i, "cost_limit": limit, "step": step, **figures}
@@ -66,13 +81,40 @@ def _steps(setup: Setup, state: ActingState) -> list[int]:
     return [int(update) * setup.config.batch_size for update in state.update]
 
 
-def evaluate_baseline(task: str, policy: str, episodes: int, options: dict[str, Any]) -> dict[str, Any]:
+def evaluate_baseline(
+    task: str, policy: str, episodes: int, options: dict[str, Any], save: pathlib.Path | None = None
+) -> dict[str, Any]:
     """Evaluates a policy that is not learned, over the same episodes as `evaluate_run`.
 
     Raises:
-      UsageError: unknown task, option or policy.
+      UsageError: unknown task, option or policy, or `save` cannot be written.
     """
+    _check_ending(save)
     env = tasks.make(task, **options)
     act = jax.vmap(tasks.baseline(env, policy))
-    results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes))())
+    record = save is not None
+    results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes, record=record))())
+    if save:
+        one_seed = _save_steps(save, {name: x[None] for name, x in results.items()}, 0)
+        results = {name: x[0] for name, x in one_seed.items()}
     return {"cost_limit": env.spec.cost_limit, **{name: interval(x) for name, x in results.items()}}
+
+
+def _check_ending(save: pathlib.Path | None) -> None:
+    if save is not None and save.suffix != ".npz":
+        raise UsageError(f"cannot write {save}: its ending must be .npz")
+
+
+def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: int) -> dict[str, np.ndarray]:
+    """Writes what was recorded of every step [seeds, horizon, episodes, ...] as [seeds, episodes, steps, ...].
+
+    Returns:
+      the other metrics.
+    """
+    length = results["episode_length"].astype(np.int32)
+    recorded = {name: x.swapaxes(1, 2)[:, :, : length.max()] for name, x in results.items() if name.startswith(STEP)}
+    table: dict[str, Any] = {"seed": np.arange(first_seed, first_seed + len(length)), "length": length}
+    table |= {name.removeprefix(STEP): x for name, x in recorded.items()}
+    with writing(out) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **table)
+    return {name: x for name, x in results.items() if name not in recorded}

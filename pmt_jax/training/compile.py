@@ -112,13 +112,14 @@ def _health(state: LearnerState) -> Metrics:
 
 
 def evaluate_seeds(
-    setup: Setup, episodes: int, deterministic: bool, fresh: bool = False
+    setup: Setup, episodes: int, deterministic: bool, fresh: bool = False, record: bool = False
 ) -> Callable[[ActingState], Metrics]:
     """`evaluate` of all seeds: state with a leading [seeds] -> metrics [seeds, episodes]."""
     hyper, _, (axis, _) = setup.vmap_arguments
 
     def one_seed(hyper: Hyper, state: ActingState) -> Metrics:
-        return evaluate(setup, state, episodes, deterministic=deterministic, fresh=fresh, hyper=hyper)
+        how = {"deterministic": deterministic, "fresh": fresh, "record": record}
+        return evaluate(setup, state, episodes, hyper=hyper, **how)
 
     return functools.partial(_over_seeds(setup, one_seed, (axis, 0)), hyper)
 

@@ -45,9 +45,43 @@ def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
     assert "unknown checkpoint 'bset'; did you mean 'best'?" in cli("eval", whole, "--which", "bset")[2]
 
 
+def test_every_step_of_an_evaluation_can_be_saved(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    file = tmp_path / "episodes.npz"
+    code, text, _ = cli("eval", whole, "--episodes", 3, "--save", file)
+    assert code == 0 and text == cli("eval", whole, "--episodes", 3)[1] + f"wrote every step to {file}\n"
+    steps = np.load(file)
+    assert steps["seed"].tolist() == [0, 1] and (steps["length"] == 25).all()
+    shapes = {"obs": (2, 3, 25, 2, 8), "action": (2, 3, 25, 2, 2), "reward": (2, 3, 25), "cost": (2, 3, 25, 2, 1)}
+    assert {name: steps[name].shape for name in shapes} == shapes
+    assert f"{steps['reward'][0].sum(1).mean():12.4f}" in text and steps["truncated"][..., -1].all()
+    now, after = (steps["info/position"][..., at] for at in (slice(0, -1), slice(1, None)))
+    push = np.clip(steps["action"][..., 1:, :, :], -1, 1)
+    np.testing.assert_allclose(after, 0.8 * now + 0.1 * push.sum((-1, -2)), atol=1e-5)  # the task's own dynamics
+    assert cli("eval", whole, "--save", tmp_path / "x.csv")[::2] == (
+        2,
+        f"pmt: cannot write {tmp_path}/x.csv: its ending must be .npz\n",
+    )
+
+
+def test_steps_after_the_end_of_an_episode_are_zero(tmp_path: pathlib.Path, cli):
+    file = tmp_path / "episodes.npz"
+    assert cli("eval", "noisy", "--policy", "zero", "--save", file)[0] == 2  # toys have no baselines
+    env = tasks.make("lane")
+    ends = jnp.array([3, 25])
+
+    def act(state: tasks.State, t: jax.Array) -> jax.Array:
+        return jnp.where((t < ends)[:, None, None], 0.0, jnp.nan) * jnp.ones((2, 2, 2))
+
+    kept = jax.jit(lambda: play(env, act, 2, record=True))()
+    assert kept["episode_length"].tolist() == [4, 25]  # broken physics ends the first
+    for name, x in kept.items():
+        if name.startswith("step/"):
+            assert (np.asarray(x[4:, 0]) == 0).all() and np.isfinite(x[:3]).all()
+
+
 def test_what_was_chosen_is_evaluated_from_other_starts(monkeypatch):
     monkeypatch.setattr(evaluate, "load_run", lambda *_: ())
-    monkeypatch.setattr(evaluate, "evaluate_states", lambda *_, fresh: fresh)
+    monkeypatch.setattr(evaluate, "evaluate_states", lambda *_, fresh, save: fresh)
     runs = (("run", "last"), ("run", "best"), ("hub:lane/r4sg", "last"))
     assert [evaluate.evaluate_run(pathlib.Path(run), 8, True, which) for run, which in runs] == [False, True, True]
 
