@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Protocol
 import jax
 import numpy as np
 
+from .blocks import Blocks
 from .errors import TaskError
 
 _NAME = re.compile(r"\w[\w+-]*(\.[\w+-]+)*")
@@ -185,11 +186,16 @@ class Declarations:
     The names of its columns in tables are declared in the registry of `envs`, which can be read without JAX.
 
     Attributes:
+      observation, state: what the entries of one agent's observation [O] and of the global state [S] are.
+      actions: for each agent the names of its action entries, without padding.
       picture: how an episode is drawn.
       baselines: name -> a function that makes a policy which needs no training.
       overflow: the name in `info` that is above 0 where the physics lost contacts, which makes a step wrong.
     """
 
+    observation: Blocks = ()
+    state: Blocks = ()
+    actions: tuple[tuple[str, ...], ...] = ()
     picture: Plain | Scene | NetworkMap = Plain()
     baselines: Mapping[str, Callable[[], Policy]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None

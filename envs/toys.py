@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .base import EnvSpec, State
+from .base import Declarations, EnvSpec, State
+from .blocks import Block, agent_index, length
 from .errors import at_least, typed
 
 HORIZON = 25
@@ -49,12 +50,22 @@ class Lane:
     def __init__(self, num_agents: int = 2) -> None:
         """`num_agents` other than 2 gives a task of the same kind whose optimum is not in the table."""
         at_least("num_agents", num_agents, 1)
+        seen = (
+            Block("position", 1, "-", "2 y - 1"),
+            Block("last action", num_agents * ACTION_DIM, "-", "of all agents, after clipping"),
+            Block("time", 1, "-", f"steps since the reset / {HORIZON}"),
+        )
+        self.declares = Declarations(
+            observation=(*seen, agent_index(num_agents)),
+            state=seen,
+            actions=tuple(tuple(f"a_{i}{j}" for j in range(ACTION_DIM)) for i in range(num_agents)),
+        )
         self.spec = EnvSpec(
             name=self.name,
             num_agents=num_agents,
-            obs_dim=2 + num_agents * ACTION_DIM + num_agents,
+            obs_dim=length(self.declares.observation),
             action_dim=ACTION_DIM,
-            state_dim=2 + num_agents * ACTION_DIM,
+            state_dim=length(seen),
             num_costs=1,
             horizon=HORIZON,
             action_mask=np.ones((num_agents, ACTION_DIM), np.float32),

@@ -26,6 +26,7 @@ import mujoco
 import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
+from ..blocks import Block, agent_index, joints, length, motors
 from ..errors import one_of, typed
 from ..physics import PhysicsState, make_engine
 from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model, touching
@@ -43,6 +44,11 @@ CONTACT_COST = 0.5e-3
 SURVIVAL = 1.0
 HEIGHT = (0.2, 1.0)  # m, of the torso
 LEAST_UPRIGHT = -0.7  # cosine of the torso's tilt, 134 degrees
+
+PLACE = (
+    Block("place along x", 1, "5 m"),
+    Block("place off centre", 1, "m", "along y from the corridor's centre line"),
+)
 
 COSTLY_ANT = (0.86, 0.16, 0.12, 1.0)  # what a picture shows at the moment of cost: the ant in red,
 COSTLY_BAND = 0.36  # and the danger bands less transparent
@@ -106,15 +112,22 @@ class AntCorridor:
             threads=threads,
         )
         self.engine = self._engine.name
-        self.declares = Declarations(picture=Scene(self.raw, self.model, self.decorate), overflow="physics_overflow")
         action_dim = self.model.nu // num_agents
-        state_dim = self.model.nq - 2 + self.model.nv + 2
+        seen = (*joints(self.model, unseen=2), *PLACE)
+        names = motors(self.model)
+        self.declares = Declarations(
+            observation=(*seen, agent_index(num_agents)),
+            state=seen,
+            actions=tuple(tuple(names[i * action_dim :][:action_dim]) for i in range(num_agents)),
+            picture=Scene(self.raw, self.model, self.decorate),
+            overflow="physics_overflow",
+        )
         self.spec = EnvSpec(
             name=f"ant_{num_agents}x{action_dim}",
             num_agents=num_agents,
-            obs_dim=state_dim + num_agents,
+            obs_dim=length(self.declares.observation),
             action_dim=action_dim,
-            state_dim=state_dim,
+            state_dim=length(seen),
             num_costs=1,
             horizon=HORIZON,
             action_mask=np.ones((num_agents, action_dim), np.float32),

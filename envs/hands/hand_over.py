@@ -38,6 +38,7 @@ import mujoco
 import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
+from ..blocks import Block, Blocks, length, motors
 from ..errors import one_of, typed
 from ..physics import PhysicsState, make_engine, resolve
 
@@ -59,6 +60,26 @@ FALLEN = 0.2  # m, height of the object's centre from which the episode ends
 
 VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0  # of joint and spin velocities, of forces and torques in observations
 OBS_BOUND = 5.0
+
+HAND = (  # what a hand's own agents see of it; `_get_obs` has the same order
+    Block("joint angles", JOINTS, "-", "place in the joint's range, -1 to 1"),
+    Block("joint velocities", JOINTS, "5 rad/s"),
+    Block("joint forces", JOINTS, "0.1 N m", "motor and constraints, without damping"),
+    Block(
+        "fingertip frames", 13 * len(FINGERS), "m, -, m/s, rad/s", "place, quaternion (w last), velocity, spin"
+    ),
+    Block("fingertip wrenches", 6 * len(FINGERS), "0.1 N, 0.1 N m", "force and torque on each, in its frame"),
+    Block("last action", MOTORS, "-", "after clipping"),
+)
+SHARED = (  # what all agents see
+    Block("object place", 3, "m"),
+    Block("object orientation", 4, "-", "quaternion, w last"),
+    Block("object velocity", 3, "m/s"),
+    Block("object spin", 3, "5 rad/s", "world frame"),
+    Block("goal place", 3, "m"),
+    Block("goal orientation", 4, "-", "quaternion, w last"),
+    Block("turn from the goal", 4, "-", "object orientation times inverse goal orientation, w last"),
+)
 
 # name -> number of agents, costly entries of the joint action, largest absolute value that is free
 VARIANTS: dict[str, tuple[int, tuple[int, ...], float]] = {
@@ -184,18 +205,23 @@ class HandOver:
             threads=threads,
         )
         self.engine = self._engine.name
-        self.declares = Declarations(picture=Scene(self.raw, self.model, self.decorate), overflow="physics_overflow")
         self._joint_range = self.model.jnt_range[:HINGES]  # [48, 2] rad
         self._motor_range = self.model.actuator_ctrlrange  # [40, 2] rad
         self._chains = _chains(self.model)
         mask = _action_mask(num_agents)
-        hand_dim, shared_dim = 3 * JOINTS + len(FINGERS) * (13 + 6) + MOTORS, 13 + 11
+        self.declares = Declarations(
+            observation=(*HAND, *SHARED),
+            state=(*_of_hand(0), *_of_hand(1), *SHARED),
+            actions=_motors(self.model, mask),
+            picture=Scene(self.raw, self.model, self.decorate),
+            overflow="physics_overflow",
+        )
         self.spec = EnvSpec(
             name=f"hand_over_{variant}",
             num_agents=num_agents,
-            obs_dim=hand_dim + shared_dim,
+            obs_dim=length(self.declares.observation),
             action_dim=mask.shape[1],
-            state_dim=HANDS * hand_dim + shared_dim,
+            state_dim=length(self.declares.state),
             num_costs=1,
             horizon=HORIZON,
             action_mask=mask,
@@ -358,6 +384,16 @@ class HandOver:
         """Whether the object fell, or the physics broke."""
         sound = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
         return ~(sound & (physics.qpos[HINGES + 2] > FALLEN))
+
+
+def _of_hand(number: int) -> Blocks:
+    return tuple(block._replace(name=f"hand {number} {block.name}") for block in HAND)
+
+
+def _motors(model: mujoco.MjModel, mask: np.ndarray) -> tuple[tuple[str, ...], ...]:
+    """Each agent's motors; agents fill the actuators in order."""
+    names = iter(motors(model))
+    return tuple(tuple(next(names) for _ in range(int(own))) for own in mask.sum(axis=1))
 
 
 def _action_mask(num_agents: int) -> np.ndarray:

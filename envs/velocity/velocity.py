@@ -36,6 +36,7 @@ import mujoco
 import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
+from ..blocks import Block, Blocks, agent_index, joints, length, motors
 from ..errors import TaskError, one_of, typed
 from ..physics import PhysicsState, Readout, make_engine
 from . import VARIANTS, Partition
@@ -116,14 +117,20 @@ class Velocity:
         partition = benchmark_partition if partition is None else _checked(partition, self.model.nu)
         self._agent, self._entry, mask = _motors(partition)
         self._build_engine(physics, solver, threads)
-        state_dim = self.model.nq - self.robot.unseen + self.model.nv
-        state_dim += 16 * self.model.nbody + self.model.nv + 6 * self.model.nbody if self.robot.sees_forces else 0
+        seen, names = (*joints(self.model, self.robot.unseen), *self._forces()), motors(self.model)
+        self.declares = Declarations(
+            observation=(*seen, agent_index(len(partition))),
+            state=seen,
+            actions=tuple(tuple(names[motor] for motor in agent) for agent in partition),
+            picture=Scene(self._drawn, self.model, self.decorate),
+            overflow="physics_overflow",
+        )
         self.spec = EnvSpec(
             name=f"velocity_{variant}",
             num_agents=len(partition),
-            obs_dim=state_dim + len(partition),
+            obs_dim=length(self.declares.observation),
             action_dim=mask.shape[1],
-            state_dim=state_dim,
+            state_dim=length(seen),
             num_costs=2 if fall_cost else 1,
             horizon=HORIZON,
             action_mask=mask,
@@ -147,8 +154,17 @@ class Velocity:
         self._control_dt = self.robot.substeps * self.model.opt.timestep
         if self.robot.sees_forces:
             self._kinematics = make_kinematics(self.model)
-        picture = Scene(self._drawn, self.model, self.decorate)
-        self.declares = Declarations(picture=picture, overflow="physics_overflow")
+
+    def _forces(self) -> Blocks:
+        """What a robot that sees forces observes after its joints; the order is that of `_FORCES`."""
+        bodies, every = self.model.nbody, f"of {self.model.nbody} bodies, the world among them"
+        blocks = (
+            Block("inertias", 10 * bodies, "kg m2, kg m, kg", f"cinert {every}"),
+            Block("body velocities", 6 * bodies, "rad/s, m/s", f"cvel {every}"),
+            Block("motor forces", self.model.nv, "N, N m", "qfrc_actuator of every degree of freedom"),
+            Block("contact forces", 6 * bodies, "N m, N", f"cfrc_ext {every}"),
+        )
+        return blocks if self.robot.sees_forces else ()
 
     def reset(self, key: jax.Array) -> State:
         """The robot near its reference pose."""

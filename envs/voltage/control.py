@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base import Declarations, EnvSpec, NetworkMap, State
+from ..blocks import Block, Blocks, length
 from ..errors import TaskError, at_least, one_of, typed
 from . import power_flow
 from .baselines import POLICIES
@@ -43,7 +44,13 @@ VOLTAGE_WEIGHT, Q_WEIGHT = 1.0, 0.1
 COLLAPSE_PENALTY = 200.0
 INVERTER_HEADROOM = 1.2  # apparent power rating over the largest active power
 MAX_RESETS = 1000  # dates tried until one can be solved; MAPDN has no limit
-BLOCKS = ("demand", "pv", "reactive", "vm_pu", "va_degree")
+BLOCKS = {  # option state_space -> name and unit of each of its blocks, in `_views`' order
+    "demand": (("active demand", "MW"), ("reactive demand", "MVAr")),
+    "pv": (("PV power", "MW"),),
+    "reactive": (("inverter's reactive power", "MVAr"),),
+    "vm_pu": (("voltage", "p.u."),),
+    "va_degree": (("voltage angle", "rad"),),
+}
 BARRIERS = ("l1", "l2", "bowl", "courant_beltrami", "bump")
 COSTS = ("any", "share", "excess_sum", "excess_mean")
 SCOPES = ("network", "zone", "regions")
@@ -151,7 +158,7 @@ class VoltageControl:
         timing: str = "mapdn",
         episode_limit: int = EPISODE_LIMIT,
         history: int = 1,
-        state_space: str | tuple[str, ...] = BLOCKS,
+        state_space: str | tuple[str, ...] = tuple(BLOCKS),
         pv_scale: float = 1.0,
         demand_scale: float = 1.0,
     ) -> None:
@@ -174,9 +181,9 @@ class VoltageControl:
         self.spec = EnvSpec(
             name={"case33": "voltage_33", "case141": "voltage_141"}.get(scenario.name) or _slug(scenario.name),
             num_agents=self.num_agents,
-            obs_dim=self._seen.shape[1] * history,
+            obs_dim=length(self._observed),
             action_dim=1,
-            state_dim=int(self._stated.size),
+            state_dim=length(self._described),
             num_costs=self._cost_masks.shape[0] if cost_scope == "regions" else 1,
             horizon=self._limit - self._first_row,
             action_mask=np.ones((self.num_agents, 1), np.float32),
@@ -190,6 +197,11 @@ class VoltageControl:
         self.num_loads = len(table["load_bus"])
         self._dtype = jnp.zeros(()).dtype  # f64 in an environment made under jax.enable_x64
         self._seen, self._stated = _views(n, table["pv_bus"], table["zone"], blocks)
+        largest = max(int(np.sum(table["zone"] == zone)) for zone in table["zone"][table["pv_bus"]])
+        frame = _describe(blocks, largest, 1, "of the own region")
+        ages = [f", {age} steps ago" if age else "" for age in reversed(range(self._history))]
+        self._observed = tuple(block._replace(name=block.name + age) for age in ages for block in frame)
+        self._described = _describe(blocks, n, self.num_agents, "of all buses", angle="degree")
         self._loads_at = _by_bus(table["load_bus"], n)
         self._pvs_at = _by_bus(table["pv_bus"], n)
         regions = range(1, int(table["zone"].max()) + 1)
@@ -225,6 +237,9 @@ class VoltageControl:
         links = np.array([pair if x[pair[0]] <= x[pair[1]] else pair[::-1] for pair in np.asarray(network.branch_bus)])
         band = self.v_lower, self.v_upper
         return Declarations(
+            observation=self._observed,
+            state=self._described,
+            actions=(("inverter's reactive power",),) * self.num_agents,
             picture=NetworkMap(
                 self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"]), unit="p.u."
             ),
@@ -502,6 +517,16 @@ def _blocks(state_space: str | tuple[str, ...]) -> tuple[str, ...]:
 def _slug(name: str) -> str:
     """A network's name as a task's, whose name folders bear."""
     return re.sub(r"\W+", "_", name).strip("_") or "network"
+
+
+def _describe(chosen: tuple[str, ...], buses: int, plants: int, whose: str, angle: str = "rad") -> Blocks:
+    """What `_views` picks, of so many buses and plants; an agent sees angles in rad, the state has them in degrees."""
+    found = []
+    for name, unit in (pair for block in chosen for pair in BLOCKS[block]):
+        of_plants = name in ("PV power", "inverter's reactive power")
+        meaning = ("in the data row to come" if name == "PV power" else "") if of_plants else whose
+        found.append(Block(name, plants if of_plants else buses, angle if name == "voltage angle" else unit, meaning))
+    return tuple(found)
 
 
 def _views(n: int, pv_bus: np.ndarray, zone: np.ndarray, blocks: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
 import envs
 from envs.base import declarations
+from envs.blocks import length, slices
+from envs.voltage.control import load_scenario
 from places import ROOT
 
 NEEDS = {"plain": set(), "scene": {"qpos"}, "map": {"vm_pu"}}  # of the quantities that a picture reads
@@ -24,9 +28,84 @@ def test_declarations_name_what_is_there(name):
     declared = declarations(env)
     assert declared.overflow is None or declared.overflow in state.info
     assert set(envs.columns(name)) <= set(state.info)
+    assert (length(declared.observation), length(declared.state)) == (state.obs.shape[1], state.global_state.shape[0])
+    assert [len(names) for names in declared.actions] == env.spec.action_mask.sum(1).tolist()
     assert NEEDS[declared.picture.kind] <= set(jax.eval_shape(declared.picture.raw, state))
     for make in declared.baselines.values():
         assert jax.eval_shape(make(), state).shape == env.spec.action_mask.shape
+
+
+def blocks(name: str, agent: int = 0, **options: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """An agent's observation and the global state by block, and the quantities that they show, right after a reset."""
+    env: Any = envs.make(name, **options)
+    state = env.reset(jax.random.key(3))
+    observation, whole = slices(env.declares.observation), slices(env.declares.state)
+    seen = {block: np.asarray(state.obs[agent][where]) for block, where in observation.items()}
+    return seen, {block: np.asarray(state.global_state[where]) for block, where in whole.items()}, env.raw(state)
+
+
+@pytest.mark.parametrize(
+    "name", ["ant_4x2", "velocity_ant_2x4", pytest.param("velocity_humanoid_9_8", marks=[pytest.mark.full])]
+)
+def test_blocks_of_a_robot_hold_what_they_are_called(name):
+    seen, state, raw = blocks(name, observation="raw")
+    qpos, qvel = raw["qpos"], raw["qvel"]
+    expected = {
+        "torso height": qpos[2:3],
+        "torso orientation": qpos[3:7],
+        "joint angles": qpos[7:],
+        "torso velocity": qvel[:3],
+        "torso spin": qvel[3:6],
+        "joint velocities": qvel[6:],
+    }
+    for block, values in expected.items():
+        np.testing.assert_array_equal(seen[block], values)
+        np.testing.assert_array_equal(state[block], values)
+    np.testing.assert_array_equal(seen["agent index"], np.eye(len(seen["agent index"]))[0])
+    if name.startswith("ant"):
+        np.testing.assert_allclose(seen["place along x"], qpos[:1] / 5)
+
+
+def test_blocks_of_a_planar_robot_hold_what_they_are_called():
+    seen, _, raw = blocks("velocity_hopper_3x1", observation="raw")
+    entries = [*raw["qpos"][1:3], raw["qpos"][3:], *raw["qvel"][:3], raw["qvel"][3:]]
+    for values, expected in zip(seen.values(), entries, strict=False):
+        np.testing.assert_array_equal(values, np.atleast_1d(expected))
+    assert list(seen)[:3] == ["rootz", "rooty", "joint angles"] and list(seen)[3] == "rootx velocity"
+
+
+@pytest.mark.full
+def test_blocks_of_a_grid_hold_what_they_are_called():
+    table = load_scenario("case33").table
+    regions = [table["zone"] == table["zone"][bus] for bus in table["pv_bus"]]
+    agent = int(np.argmax([region.sum() for region in regions]))  # of the largest region, as the blocks are
+    seen, state, raw = blocks("voltage_33", agent)
+    np.testing.assert_allclose(seen["PV power"], raw["row"][agent])
+    np.testing.assert_allclose(seen["inverter's reactive power"], raw["q"][agent])
+    np.testing.assert_allclose(seen["voltage"], raw["vm_pu"][regions[agent]])
+    np.testing.assert_allclose(seen["voltage angle"], raw["va_rad"][regions[agent]])
+    np.testing.assert_allclose(state["voltage"], raw["vm_pu"])
+    np.testing.assert_allclose(state["voltage angle"], np.rad2deg(raw["va_rad"]), rtol=1e-5)
+    np.testing.assert_allclose(state["active demand"], raw["p_bus"])
+    assert set(seen) == set(state)
+    longer: Any = envs.make("voltage_33", history=2)
+    assert [x.name for x in longer.declares.observation][::6] == ["active demand, 1 steps ago", "active demand"]
+
+
+@pytest.mark.full
+def test_blocks_of_the_hands_hold_what_they_are_called():
+    seen, state, raw = blocks("hand_over_2x6")
+    np.testing.assert_allclose(seen["object place"], raw["qpos"][48:51])
+    np.testing.assert_allclose(seen["goal orientation"], np.roll(raw["goal_quat"], -1))
+    np.testing.assert_allclose(seen["joint velocities"], 0.2 * raw["qvel"][:24])
+    np.testing.assert_allclose(state["hand 1 joint velocities"], 0.2 * raw["qvel"][24:48])
+    np.testing.assert_array_equal(seen["last action"], raw["last_action"][:20])
+
+
+def test_blocks_of_a_toy_hold_what_they_are_called():
+    seen, _, raw = blocks("lane")
+    assert seen["position"] == 2 * raw["position"] - 1 and seen["time"] == 0
+    np.testing.assert_array_equal(seen["last action"], raw["last_action"].ravel())
 
 
 def test_a_task_that_declares_nothing_has_the_defaults():
