@@ -5,7 +5,7 @@ bench/tables.py makes of the results; whatever stood there before is replaced. T
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
 `paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks,
 `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each pair of methods. The study's forms are in
-bench/study.py.
+bench/study.py; those of tasks, settings and methods, as `observation:ant_2x4`, in bench/pages.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
-from . import records, runs, study
+from . import pages, records, runs, study
 from .tables import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -45,6 +45,8 @@ def render(text: str, reports: Reports) -> str:
         form, _, file = name.partition(":")
         if form in STORED:
             return f"{begin}{STORED[form](records.RESULTS / f'{file}.json')}\n{end}"
+        if form in pages.FORMS:
+            return f"{begin}{pages.FORMS[form](file)}\n{end}"
         if name not in TABLES:
             raise UsageError(f"unknown table '{name}'{did_you_mean(name, TABLES)}")
         return f"{begin}{TABLES[name](reports)}\n{end}"

@@ -25,6 +25,7 @@ Run = dict[str, Any]
 CURVES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
 TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_seen have none
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "cost_critic/explained_variance")  # means over seeds
+HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 WHILE_TRAINING = "cost while training"
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
@@ -199,9 +200,23 @@ def as_points(file: pathlib.Path) -> str:
     return markdown(("task", "method", *present), body)
 
 
+def as_method(file: pathlib.Path) -> str:
+    """The method that `file` is named after on the README's tasks, MAPPO-Lagrangian below it."""
+    body = []
+    for name in HEADLINES:
+        found = {run["method"]: run for run in load(file.with_stem(name))}
+        for method in dict.fromkeys((file.stem, "mappo_l")):
+            (row,) = table.summarise([_row(found[method])])
+            line = [f"`{row['task']}`", f"`{method}`"]
+            line += [_mean_std(row[figure]["mean"], row[figure]["std"]) for figure in ("reward", "cost")]
+            body.append([*line, f"{row['cost_limit']:g}", f"{round(row['within'] * row['seeds'])} of {row['seeds']}"])
+    return markdown(("task", "method", "reward", "cost", "limit", "seeds within"), body)
+
+
 FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "curves": as_pmt_table,
     "points": as_points,
+    "method": as_method,
     "paper": as_paper,
     "summary": as_summary,
     "ran": as_ran,

@@ -1,7 +1,7 @@
 """Where ants go: paths through the corridor of a few episodes of each policy, and a picture of them.
 
-    python -m docs.figures.ant_paths                                draws docs/ant_paths.png from bench/results
-    python -m docs.figures.ant_paths R4SG=hub:ant_2x4/r4sg runs/x   of other policies, which it stores there first
+    python -m docs.figures.ant_paths                                draws all that is stored in bench/results
+    python -m docs.figures.ant_paths R4SG=hub:ant_2x4/r4sg runs/x   stores these as ant_paths.json and draws them
 
 Every episode is the seed's `last` policy from one of the fixed starts of evaluations, actions sampled. A run's first
 seed is shown; `NAME=FOLDER` gives a policy a title, `FOLDER@3` takes seed 3.
@@ -21,9 +21,13 @@ from envs.ant import corridor
 from envs.ant.walls import COSTLY_REACH, DANGER, HALF_WIDTH, THICKNESS
 from pmt_jax.errors import UsageError
 from pmt_jax.render.episode import record_run
+from pmt_jax.studies.plot import BLUE, METHOD_COLOURS
 from pmt_jax.training.compile import use_cache
 
+from . import style
+
 ROOT = pathlib.Path(__file__).parents[2]
+RESULTS = ROOT / "bench" / "results"
 EPISODES = 6
 EVERY = 10  # control steps between two points of a path
 
@@ -64,27 +68,35 @@ def _draw_walls(panel: Any, walls: str, furthest: float) -> None:
     behind = {"reference": DANGER, "costly": 2 * COSTLY_REACH, "solid": 0.0}[walls]
     for side in (-1, 1):
         wall = centre + side * HALF_WIDTH
-        panel.fill_between(x, wall - side * DANGER, wall + side * behind, color="#f3c6c0", lw=0)
-        panel.plot(x, wall, color="#a33", lw=1)
+        panel.fill_between(x, wall - side * DANGER, wall + side * behind, color=style.DANGER, lw=0)
+        panel.plot(x, wall, color=style.WALL, lw=1)
         if walls == "solid":
-            panel.fill_between(x, wall, wall + side * THICKNESS, color="#a33", lw=0)
+            panel.fill_between(x, wall, wall + side * THICKNESS, color=style.WALL, lw=0)
 
 
 def draw(policies: list[dict[str, Any]], file: pathlib.Path) -> None:
-    """One panel a policy: the corridor, where it costs, and the paths."""
+    """One panel a policy: the corridor, where it costs, and the paths; two columns of more than four policies."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 2.4 * len(policies)), layout="constrained")
-    panels = figure.subplots(len(policies), squeeze=False, sharex=True)[:, 0]
+    across = 1 + (len(policies) > 4)
+    down = -(-len(policies) // across)
+    figure = Figure(figsize=(9 if across == 1 else 12, (2.4 if across == 1 else 2.0) * down), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
+    for panel in panels[len(policies) :]:
+        panel.set_axis_off()
     furthest = min(140.0, max(max(e["x"]) for policy in policies for e in policy["episodes"]) + 5)
-    for panel, policy in zip(panels, policies, strict=True):
+    colours = {style.NAMES[method]: colour for method, colour in METHOD_COLOURS.items()}
+    for panel, policy in zip(panels, policies, strict=False):
         _draw_walls(panel, policy.get("walls", "reference"), furthest)
         for episode in policy["episodes"]:
-            panel.plot(episode["x"], episode["y"], color="#25557f", lw=0.9, alpha=0.8)
+            panel.plot(episode["x"], episode["y"], color=colours.get(policy["title"], BLUE), lw=1, alpha=0.9)
         reward, cost = (np.mean([e[name] for e in policy["episodes"]]) for name in ("reward", "cost"))
         panel.set_title(f"{policy['title']}: reward {reward:,.0f}, cost {cost:.1f}", loc="left", fontsize=10)
-        panel.set(ylabel="y (m)", ylim=(-25, 30), xlim=(-5, furthest))
-    panels[-1].set_xlabel("x (m)")
+        panel.set(ylim=(-25, 30), xlim=(-5, furthest))
+    for panel in panels[::across]:
+        panel.set_ylabel("y (m)")
+    for panel in panels[-across:]:
+        panel.set_xlabel("x (m)")
     figure.savefig(file, dpi=110)
 
 
@@ -92,15 +104,17 @@ def main(words: list[str] | None = None) -> None:
     """Records the paths of the policies that are named, if any, and draws those that are stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policies", nargs="*", metavar="[TITLE=]RUN[@SEED]")
-    parser.add_argument("--json", type=pathlib.Path, default=ROOT / "bench" / "results" / "ant_paths.json")
-    parser.add_argument("--png", type=pathlib.Path, default=ROOT / "docs" / "ant_paths.png")
+    parser.add_argument("--json", type=pathlib.Path, help="where paths are stored (bench/results/ant_paths.json)")
+    parser.add_argument("--png", type=pathlib.Path, help="the picture (docs/NAME.png for NAME.json)")
     arguments = parser.parse_args(words)
     use_cache()
     try:
         if arguments.policies:
             found = [paths(source, EPISODES) for source in arguments.policies]
+            arguments.json = arguments.json or RESULTS / "ant_paths.json"
             arguments.json.write_text(json.dumps(found) + "\n")
-        draw(json.loads(arguments.json.read_text()), arguments.png)
+        for file in [arguments.json] if arguments.json else sorted(RESULTS.glob("ant_paths*.json")):
+            draw(json.loads(file.read_text()), arguments.png or ROOT / "docs" / f"{file.stem}.png")
     except (OSError, UsageError) as error:
         parser.error(str(error))
 

@@ -1,4 +1,4 @@
-"""Draws docs/NAME.png, the training curves of the runs in a file of bench/results, as `pmt plot` draws run folders.
+"""Draws docs/NAME.png, reward and cost over training of the runs in a file of bench/results.
 
 python -m docs.figures.curves          all of them
 python -m docs.figures.curves table2   some
@@ -8,9 +8,19 @@ from __future__ import annotations
 
 import pathlib
 import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from bench import records, runs
 from pmt_jax.studies import plot
+from pmt_jax.studies.run_log import Group
+
+from . import style
 
 DOCS = pathlib.Path(__file__).parents[1]
 FIGURES = {
@@ -22,13 +32,49 @@ FIGURES = {
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
 }
+PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
+
+
+def draw(shown: Sequence[Group], file: pathlib.Path) -> None:
+    """Two panels of one task: the mean over seeds with the method's name beside it, and the seeds' range in a band."""
+    with rc_context(style.FONT):
+        figure = Figure(figsize=(10, 4.2), layout="constrained")
+        for axis, (name, title) in zip(figure.subplots(1, 2), PANELS.items(), strict=True):
+            ends = [_line(axis, group, name, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
+            axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
+            axis.set_xlabel("environment steps of a seed")
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axis.set_xlim(0, max(int(run.steps[-1]) for group in shown for run in group.runs))
+            if name == "episode_cost":
+                plot.cost_axis(axis, shown, name)
+                axis.set_ylabel("linear up to the limit, then log" if axis.get_yscale() == "symlog" else "")
+                style.name_limit(axis, shown[0].cost_limit)
+            style.label_lines(axis, ends)
+        seeds = max(len(group.seeds) for group in shown)
+        band = f"mean of {seeds} seeds" + (
+            ", band from the lowest to the highest" if len(shown) <= plot.MOST_BANDS else ""
+        )
+        figure.suptitle(f"{shown[0].task}: {band}", x=0.01, ha="left", fontsize=11)
+        figure.savefig(file, dpi=110)
+
+
+def _line(axis: Any, group: Group, name: str, banded: bool) -> tuple[str, float]:
+    """Draws a method's mean over seeds; returns where it ends."""
+    steps, values = plot.curve(group, name)
+    known = np.isfinite(values).any(0)
+    low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))
+    colour = plot.METHOD_COLOURS[group.method]
+    axis.plot(steps[known], mean, color=colour, lw=2)
+    if banded:
+        axis.fill_between(steps[known], low, high, color=colour, alpha=0.18, lw=0)
+    return group.method, float(mean[-1])
 
 
 def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     for name in names or FIGURES:
         found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
-        plot.draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png")
+        draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png")
         print(f"docs/{name}.png")
 
 

@@ -11,7 +11,7 @@ throwing hand's index finger: the cost is a function of the action alone, which 
 | `hand_over_safe_joint`  | as 2x6                      | 4                                   | 0.5    |
 | `hand_over_safe_finger` | as 2x6                      | any of 2, 3, 4 (FFJ3, FFJ2, FFJ1)   | 0.5    |
 
-Written from the facts of the public reference task; `docs/hand_over.md` lists what differs from Isaac Gym and why.
+Written from the facts of the public reference task; `docs/tasks/hand_over.md` lists what differs from Isaac Gym.
 
 Example:
   >>> import jax, envs
@@ -65,9 +65,7 @@ HAND = (  # what a hand's own agents see of it; `_get_obs` has the same order
     Block("joint angles", JOINTS, "-", "place in the joint's range, -1 to 1"),
     Block("joint velocities", JOINTS, "5 rad/s"),
     Block("joint forces", JOINTS, "0.1 N m", "motor and constraints, without damping"),
-    Block(
-        "fingertip frames", 13 * len(FINGERS), "m, -, m/s, rad/s", "place, quaternion (w last), velocity, spin"
-    ),
+    Block("fingertip frames", 13 * len(FINGERS), "m, -, m/s, rad/s", "place, quaternion (w last), velocity, spin"),
     Block("fingertip wrenches", 6 * len(FINGERS), "0.1 N, 0.1 N m", "force and torque on each, in its frame"),
     Block("last action", MOTORS, "-", "after clipping"),
 )

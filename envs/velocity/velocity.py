@@ -12,7 +12,7 @@
 | `velocity_humanoid_9_8`     | humanoid     | 9 and 8         | 0.58                     |
 
 Written from the facts of the public reference and checked against transitions recorded from it; `robots.py` holds what
-tells the robots apart, `docs/velocity.md` what differs from SafePO.
+tells the robots apart, `docs/tasks/velocity.md` what differs from SafePO.
 
 Example:
   >>> import jax, envs

@@ -214,7 +214,7 @@ def _panel(axis: Any, shown: Sequence[Group], name: str, title: str) -> None:
         elif len(values) > 1:
             _spread(axis, end * (1.04 + 0.025 * number), values, look.colour)
     if name in COSTS:
-        _cost_axis(axis, shown, name)
+        cost_axis(axis, shown, name)
     axis.set_title(title, fontsize=9)
     axis.set_xlabel("environment steps of a seed", fontsize=8)
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -232,7 +232,7 @@ def _spread(axis: Any, x: float, values: np.ndarray, colour: str) -> None:
         axis.plot([x], [seeds.mean()], color=colour, marker="o", ms=3.5, ls="")
 
 
-def _cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
+def cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
     """The limit as a dashed line; linear up to it, logarithmic beyond where costs are many times as high."""
     from matplotlib.ticker import FixedLocator, NullLocator
 

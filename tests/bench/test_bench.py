@@ -14,12 +14,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, records, render, runner, runs, tables
+from bench import compare, measure, once, pages, records, render, runner, runs, tables
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
-from docs.figures import ant_paths, curves
+from docs.figures import ant_paths, curves, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError
 from pmt_jax.studies import points, table
@@ -226,7 +227,12 @@ def test_every_result_is_used_by_a_page_or_a_test():
     shown = {name for text in pages for _, name, _, _ in render.BLOCK.findall(text)}
     blocks = {name.partition(":")[2] or name for name in shown}
     benches = {tables.TABLES[name].result for name in blocks if isinstance(tables.TABLES.get(name), tables.Table)}
-    elsewhere = {"ant_paths", "hand_over_catch", *curves.FIGURES.values()}  # of pictures, and of a test
+    elsewhere = {
+        "ant_paths",
+        "ant_paths_methods",
+        "hand_over_catch",
+        *curves.FIGURES.values(),
+    }  # of pictures, and of a test
     for file in records.RESULTS.glob("*.json"):
         used = file.stem in blocks | elsewhere or any(
             file.stem == name or file.stem.startswith(f"{name}_") for name in benches
@@ -244,6 +250,28 @@ def test_rendering_replaces_blocks_and_nothing_else():
     for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
         with pytest.raises(UsageError):
             render.render(broken, reports)
+
+
+def test_pages_describe_what_there_is():
+    for form, name, said in (
+        ("observation", "lane", "| 1 to 4 | last action | - | of all agents, after clipping |"),
+        ("actions", "velocity_swimmer_2x1", "| `velocity_swimmer_2x1` | 1 | 0 motor2_rot |"),
+        ("options", "velocity_swimmer_2x1", "| `fall_cost` | `false` | adds a second cost"),
+        ("tasks", "lane+noisy", "| `noisy` | "),
+        ("settings", "fear_time", "| `fear_time` | `next` | `next`, `current` | fear of the state"),
+        ("switches", "all", "| `f4sg` | sequential, an actor each | lagrangian | fear | none |"),
+    ):
+        assert said in pages.FORMS[form](name)
+    for form, name in (("observation", "lan"), ("settings", "fear_tim")):
+        with pytest.raises(UsageError, match="did you mean"):
+            pages.FORMS[form](name)
+
+
+def test_names_beside_lines_do_not_overlap():
+    axis: Any = Figure().subplots()
+    style.label_lines(axis, [(method, 0.5 + 0.001 * i) for i, method in enumerate(style.NAMES)])
+    heights = sorted(text.get_position()[1] for text in axis.texts)
+    assert len(heights) == len(style.NAMES) and np.diff(heights).min() > 0.9 * style.GAP
 
 
 def test_the_readme_is_short_and_its_figures_are_made():
