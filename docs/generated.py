@@ -117,8 +117,8 @@ def tutorial() -> str:
 
 
 def from_the_top(name: str) -> Callable[[], str]:
-    """A file of the repository's top level as a page, whose links to other pages are relative to docs/."""
-    return lambda: re.sub(r"\]\(docs/", "](", (ROOT / name).read_text())
+    """A file of the repository's top level as a page, whose links are relative to its folder."""
+    return lambda: re.sub(r"\]\(docs/", "](../", (ROOT / name).read_text())
 
 
 def palette() -> str:
