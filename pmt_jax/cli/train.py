@@ -30,6 +30,9 @@ def add(commands: Any) -> None:
     output.add_argument("--out", type=pathlib.Path, metavar="DIR", help="the run folder (default: a new one in runs/)")
     output.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     output.add_argument(
+        "--change", action="store_true", help="with --resume: go on with other settings than the run began with"
+    )
+    output.add_argument(
         "--sink",
         type=names,
         default=[],
@@ -54,6 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
+    if arguments.change and not arguments.resume:
+        raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
     from ..policies import warm_start
     from ..training import processes, trainer
 
@@ -69,4 +74,5 @@ def run(arguments: argparse.Namespace) -> int:
         count=arguments.devices,
         warm_start=warm_start.prepare,
         debug=arguments.debug,
+        change=arguments.change,
     )

@@ -202,7 +202,7 @@ def read(folder: pathlib.Path) -> RunLog | None:
         task=last["task"],
         method=last["method"],
         cost_limit=last["cost_limit"],
-        settings=flat(load_config(folder / "config.toml")),
+        settings=flat(load_config(folder / "config.toml")) | _changes(folder),
         seeds=tuple(seeds),
         steps=np.array(steps),
         metrics=_metrics(rows, seeds, steps, metrics),
@@ -239,6 +239,13 @@ def _metrics(
                 where = f"{name} = {json.dumps(value)[:40]} at step {row['step']}"
                 raise UsageError(f"{file}: a row has {where}, where a number or null belongs") from None
     return found
+
+
+def _changes(folder: pathlib.Path) -> dict[str, str]:
+    """Which settings changed after which step (--change), as one more setting; {} where none did."""
+    rows = read_rows(folder / "changes.jsonl")
+    told = [f"{name} {x} at {row['step']:,}" for row in rows for name, x in row["changed"].items()]
+    return {"changed": "; ".join(told)} if told else {}
 
 
 def _versions(folder: pathlib.Path) -> dict[str, Any]:

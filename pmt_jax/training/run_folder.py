@@ -28,6 +28,7 @@ from .checkpoint import Checkpoints
 from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear")  # of a run; --change cannot change it
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
@@ -60,30 +61,44 @@ def check_out(out: pathlib.Path, resume: bool) -> None:
         raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
 
 
-def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say) -> None:
+def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say, change: bool = False) -> None:
     """Whether a claimed folder is empty, or holds the run to resume.
+
+    Args:
+      change: the settings may differ from the run's, all but `IDENTITY`.
 
     Raises:
       UsageError: it does not, or the run was made with other settings or another physics engine.
     """
     existing = out / "config.toml"
     if resume:
-        _same_settings(load_config(existing), setup.config, out)
+        _same_settings(load_config(existing), setup.config, out, change)
         _same_machine(out, setup, say)
     elif existing.exists() or any(path.name not in BEFORE_START and path.name[0] != "." for path in out.iterdir()):
         what = "another run" if existing.exists() else "other files"
         raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
 
 
-def _same_settings(old: Config, new: Config, out: pathlib.Path) -> None:
-    """Only `steps` may change when a run is continued."""
-    changed = {name: change for name, change in differences(old, new).items() if name != "steps"}
-    if changed:
-        difference = "".join(f"\n  {name}: {change}" for name, change in changed.items())
+def _same_settings(old: Config, new: Config, out: pathlib.Path, change: bool) -> None:
+    """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
+    changed = {name: x for name, x in differences(old, new).items() if name in IDENTITY or not change}
+    if changed.keys() - {"steps"}:
+        advice = "resume it unchanged (only --steps may grow), add --change to go on with the new ones"
+        if change:
+            advice = f"--change cannot change {', '.join(changed)}; leave them as they are"
+        difference = "".join(f"\n  {name}: {x}" for name, x in changed.items() if name != "steps")
         raise UsageError(
-            f"the run in {out} was made with other settings; resume it unchanged (only --steps may grow), or choose "
-            f"another --out:{difference}"
+            f"the run in {out} was made with other settings; {advice}, or choose another --out:{difference}"
         )
+
+
+def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> None:
+    """Appends what `config` changes of the run's settings after `step` to changes.jsonl, if anything."""
+    changed = {x: y for x, y in differences(load_config(out / "config.toml"), config).items() if x != "steps"}
+    if changed:
+        with (out / "changes.jsonl").open("a") as file:
+            file.write(json.dumps({"step": step, "changed": changed}) + "\n")
+        say(f"from step {step:,} on: {', '.join(f'{name} {change}' for name, change in changed.items())}")
 
 
 def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:

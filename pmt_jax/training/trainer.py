@@ -48,6 +48,7 @@ def train(
     count: int | None = None,
     warm_start: WarmStart = lambda setup: None,
     debug: bool = False,
+    change: bool = False,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -61,6 +62,7 @@ def train(
       count: of devices to split the run over, of all processes together: one where None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
+      change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
 
     Returns:
@@ -84,7 +86,7 @@ def train(
         setup = dataclasses.replace(setup, debug=debug)
         memory.check(setup)
         begin = None if resume else warm_start(setup)
-        out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say))
+        out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say, change))
         _describe(setup, out, say)
         if cache:
             use_cache()
@@ -106,14 +108,14 @@ def train(
 
 
 def _claim_folder(
-    stack: contextlib.ExitStack, setup: Setup, out: pathlib.Path | None, resume: bool, say: Say
+    stack: contextlib.ExitStack, setup: Setup, out: pathlib.Path | None, resume: bool, say: Say, change: bool
 ) -> pathlib.Path:
     """The run folder, which belongs to this process until `stack` closes."""
     created = out is None
     out = out or run_folder.create(setup)
     run_folder.check_out(out, resume)
     stack.enter_context(claims.claim(out, created))
-    run_folder.check_content(out, setup, resume, say)
+    run_folder.check_content(out, setup, resume, say, change)
     return out
 
 
@@ -172,6 +174,7 @@ class Trainer:
         if resume:
             self._restore()
             if self.step < self.total:
+                processes.by_first(lambda: run_folder.record_changes(self.out, self.step, self.config, self.say))
                 processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
         processes.by_first(lambda: self._open_loggers(stack, loggers))
         self._profile = stack.enter_context(contextlib.closing(Profile(profile)))

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax import load_policy
+from pmt_jax import load_config, load_policy
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
+from pmt_jax.studies import run_log
 from pmt_jax.training import checkpoint, loggers, run_folder, trainer
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
 
@@ -207,3 +208,31 @@ def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
         assert code == 2 and "Read-only file system; choose another --out" in err and err.count("\n") == 1
     code, _, err = cli("export", out, "-o", place / "policy")
     assert code == 2 and "Read-only file system; choose another folder" in err
+
+
+def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Path, copy: pathlib.Path, cli):
+    command = ("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 400)
+    code, text, _ = cli(*command, "--change", "--clip", 0.1)
+    assert code == 0 and f"from step {STEPS:,} on: clip 0.2 -> 0.1" in text
+    assert json.loads((copy / "changes.jsonl").read_text()) == {"step": STEPS, "changed": {"clip": "0.2 -> 0.1"}}
+    before, after = rows(whole), rows(copy)
+    assert after[: len(before)] == before and after[-1]["step"] == STEPS + 400
+    (actor,) = {int(x) for x in load.load_run(copy)[1].actor.opt_state.count.ravel()}  # Adam goes on counting
+    assert actor > {int(x) for x in load.load_run(whole)[1].actor.opt_state.count.ravel()}.pop() > 0
+    settings = load_config(copy / "config.toml")
+    assert settings.clip == 0.1 and run_log.read(copy).settings["changed"] == f"clip 0.2 -> 0.1 at {STEPS:,}"
+    assert run_log.read(copy).identity != run_log.read(whole).identity
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--seed", 5), "--change cannot change seed; leave them as they are"),
+        pytest.param(("--steps", STEPS + 200, "--hidden", 16), "expected float32", marks=pytest.mark.full),
+    ],
+)
+def test_what_cannot_change(words: tuple, said: str, copy: pathlib.Path, cli):
+    before = (copy / "config.toml").read_text()
+    code, _, err = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--change", *words)
+    assert code == 2 and said in err and "Traceback" not in err
+    assert (copy / "config.toml").read_text() == before and not (copy / "changes.jsonl").exists()
