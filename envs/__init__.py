@@ -78,7 +78,7 @@ def make(name: str, **options: Any) -> Env:
 
 
 def columns(name: str) -> Mapping[str, Column]:
-    """The figures of a task's `info` that tables show, by their name in `info`; none for a task in a file."""
+    """The entries of a task's `info` that tables show, by their name in `info`; none for a task in a file."""
     return _TASKS[name].columns if name in _TASKS else {}
 
 

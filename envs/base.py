@@ -1,7 +1,7 @@
 """The environment contract: one State in, one State out.
 
 An environment is a value with a `spec`, the name of its `engine`, and two pure functions, `reset` and `step`. It never
-resets itself and knows no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
+resets itself and has no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
 
 Example:
   >>> import jax, envs

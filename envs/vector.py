@@ -92,7 +92,7 @@ class VectorEnv:
         """Applies `action` [B, N, A]; environments that end are reset with a key they never used before.
 
         A step that leaves anything non-finite (or started from it) is quarantined: the episode terminates, its last
-        step counts reward 0 and cost 1, the last finite observation stands in for the next, and `non_finite` says so.
+        step counts reward 0 and cost 1, the last finite observation replaces the next, and `non_finite` is set.
         """
         before = state.env
         after = jax.vmap(self.env.step)(before, action)

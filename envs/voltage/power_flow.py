@@ -364,7 +364,7 @@ def _sum(terms: Sequence[jax.Array]) -> jax.Array:
 
 
 def _readout(net: Network, power: jax.Array, x: jax.Array) -> dict[str, jax.Array]:
-    """The fields of a PowerFlow, from the deviations `x` [2m] of the injection buses."""
+    """The fields of a PowerFlow, from the differences `x` [2m] of the injection buses."""
     n, m = net.n_bus, power.shape[0] // 2
     current = _current(net.no_load + x, power)
     v = _dot(current, net.voltage) + net.voltage_0

@@ -34,9 +34,9 @@ def add(commands: Any) -> None:
         "--save",
         type=pathlib.Path,
         metavar="FILE.npz",
-        help="also write every step: seed [S], length [S, E], obs [S, E, T, N, O], action [S, E, T, N, A], reward "
-        "[S, E, T], cost and true_cost [S, E, T, N, K], terminated, truncated and info/NAME [S, E, T] of S seeds, E "
-        "episodes, T steps, N agents; 0 from an episode's length on",
+        help="also write every step of S seeds, E episodes, T steps and N agents: seed [S], length [S, E], "
+        "obs [S, E, T, N, O], action [S, E, T, N, A], reward [S, E, T]; cost and true_cost [S, E, T, N, K]; "
+        "terminated, truncated and info/NAME [S, E, T]; 0 after the end of an episode",
     )
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 

@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
         run,
         "train a team: pmt train ant_2x4",
         usage="pmt train TASK|CONFIG [--SETTING VALUE ...]",
-        description="Trains on TASK, or as a TOML file says, in which every setting below may stand too.",
+        description="Trains on TASK, or with the settings of a TOML file. A file may hold every setting below.",
         add_help=False,
     )
     parser.add_argument("source", metavar="TASK|CONFIG", help=SOURCE)

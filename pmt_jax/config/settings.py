@@ -1,7 +1,7 @@
 """Settings of a run: one flat frozen dataclass, TOML in, TOML out, no JAX.
 
-`Hyper` holds the numbers that may differ between runs of one compiled program; `Config` adds everything static. What a
-setting means stands in its field's metadata, which `pmt train --help` prints. A file in `configs/` holds what all
+`Hyper` holds the numbers that may differ between runs of one compiled program; `Config` adds everything static. The
+metadata of a field define a setting, and `pmt train --help` prints them. A file in `configs/` holds what all
 methods of a task share, then a `[method.NAME]` table of what differs; it may begin with the settings of another:
 `extends = "NAME"`.
 """
@@ -108,7 +108,7 @@ class Hyper:
     lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
     surrogate_weight: float = constraint(
         1.0,
-        "weight of the mean of ratio * cost advantage in the multiplier's step; nan stands for rollout_length, which "
+        "weight of the mean of ratio * cost advantage in the multiplier's step; nan means rollout_length, which "
         "makes the mean over steps a sum",
         NOT_NEGATIVE,
     )
@@ -154,7 +154,7 @@ class Hyper:
 class Config(Hyper):
     """All settings of a run.
 
-    A number that stands for another setting (`surrogate_weight = nan`, `trust_steps = 0`) is replaced by that setting's
+    A number that means another setting (`surrogate_weight = nan`, `trust_steps = 0`) is replaced by that setting's
     value when the Config is made.
     """
 
@@ -235,7 +235,7 @@ class Config(Hyper):
     emotion_epochs: int = emotion(4, "passes over the batch for the fear and regret networks", COUNT)
     trust_steps: int = constraint(
         1,
-        "trust-region steps of MACPO per update, each on its part of the batch; 0 stands for as many as minibatches",
+        "trust-region steps of MACPO per update, each on its part of the batch; 0 means as many as minibatches",
         COUNT,
     )
     physics: Literal["auto", "mjx", "warp", "mujoco"] = simulation(

@@ -167,8 +167,8 @@ def is_better(
 ) -> np.ndarray:
     """Whether a policy is better than the best so far: [...] bool, of mean episode rewards and costs [...].
 
-    Within the cost limit beats beyond it; within it the higher reward is better, beyond it the lower cost. Figures
-    that are nan (no episode ended) are never better.
+    Within the cost limit beats beyond it; within it the higher reward is better, beyond it the lower cost. A nan
+    (no episode ended) is never better.
     """
     within, was_within = cost <= limit, best_cost <= limit
     return np.where(within & was_within, reward > best_reward, np.where(was_within, False, cost < best_cost))

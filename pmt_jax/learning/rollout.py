@@ -48,7 +48,7 @@ def collect(
       feel: what of a step's cost the team notices; all of it by default.
 
     Returns:
-      the state to go on from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
+      the state to continue from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
     """
     mask = jnp.asarray(vector.spec.action_mask)
     normalise_obs, normalise_state = normalise

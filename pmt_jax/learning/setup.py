@@ -80,7 +80,7 @@ class Setup:
         return None if name is None else f"info/{name}"
 
     def scale(self, moments: RunningMoments, x: jax.Array) -> jax.Array:
-        """Observations or states as the networks see them: scaled by running `moments` if the config says so."""
+        """Observations or states as the networks see them: scaled by running `moments` if the config asks for it."""
         return running_moments.normalise_obs(moments, x) if self.config.obs_norm == "running" else x
 
     @property

@@ -1,6 +1,6 @@
 """Trained policies that come with the package, one a task and method, under names like `hub:ant_2x4/r4sg`.
 
-Each is a small npz: the run's settings, what of its best seed's learner state acts, and the figures it was chosen by.
+Each is a small npz: the run's settings, the part of its best seed's learner state that acts, and its evaluation.
 Kernels are 8-bit integers with a scale per output, the rest is stored as it is: docs/howto/pretrained.md has the error.
 """
 
@@ -47,7 +47,7 @@ def file_of(name: str) -> pathlib.Path:
 
 
 def about(name: str) -> dict[str, Any]:
-    """What is known of a policy: its figures, where it comes from, what packing cost (see docs/howto/pretrained.md).
+    """The description of a policy: its evaluation, its origin, the error of packing (see docs/howto/pretrained.md).
 
     Raises:
       UsageError: there is no such policy.

@@ -1,7 +1,7 @@
 """Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
 
-`python -m bench publish RUN...` does so in a checkout. All figures are means over whole episodes under mean actions;
-those that are told are from other starts than those by which the policy was chosen. A policy is better by the rule that
+`python -m bench publish RUN...` does this in a checkout. All values are means over whole episodes with mean actions;
+the published ones are from other starts than those that chose the policy. A policy is better by the rule that
 `best` checkpoints are kept by (docs/howto/evaluate.md); for methods without a constraint reward alone counts.
 """
 
@@ -32,7 +32,7 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
     """Makes the best policy of a run the pretrained one of its task and method; returns what is known about it.
 
     Args:
-      folder: the run; or the name of a pretrained policy, whose figures are measured anew.
+      folder: the run; or the name of a pretrained policy, which is measured again.
 
     Raises:
       UsageError: no run to be loaded, or one of a task that is not the package's own.
@@ -89,7 +89,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
         if is_better(*new, *reached, limit):
             chosen, reached = i, new
     if chosen is None:
-        raise UsageError(f"no policy in {folder} has figures that are numbers")
+        raise UsageError(f"no policy in {folder} has a finite reward and cost")
     which, seed = divmod(chosen, run.config.seeds)
     row = rows[chosen] | {"seed": run.config.seed + seed}
     return run, WHICH[which], row, jax.tree.map(lambda x: x[chosen : chosen + 1], both)
@@ -101,7 +101,7 @@ def figures(row: dict[str, Any]) -> dict[str, list[float]]:
 
 
 def _chosen_by(row: dict[str, Any]) -> dict[str, list[float]]:
-    """The figures by which a policy is chosen."""
+    """The values that choose a policy."""
     return {name: figures(row)[name] for name in ("episode_reward", "episode_cost")}
 
 

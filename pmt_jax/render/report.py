@@ -25,7 +25,7 @@ def report(
 ) -> None:
     """Puts run folders on one page: curves, evaluation, emotions, replay, settings and versions, all in one file.
 
-    What a run lacks (a checkpoint, say) is told in its place; the rest of the page is made.
+    If a run lacks something (a checkpoint, for example), the page has a note in its place.
 
     Args:
       folders: runs, or folders of runs; what holds none is left out with a note.

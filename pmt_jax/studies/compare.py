@@ -47,7 +47,7 @@ def with_baseline(rows: Sequence[Row], baseline: str) -> dict[tuple[str, str], C
 
 
 def overall(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Estimate]]:
-    """By label, the improvements over all tasks that have the baseline, for rows that stand in all of several."""
+    """By label, the improvements over all tasks that have the baseline, for rows that are in all of several."""
     rivals = baselines(rows, baseline)
     result = {}
     for label in dict.fromkeys(row.label for row in rows):

@@ -114,7 +114,7 @@ def caption(shown: Sequence[Group]) -> str:
 
 
 def panels(shown: Sequence[Group], wanted: dict[str, str]) -> list[str]:
-    """The metrics among `wanted` that any run knows; true costs only where a run did not feel all of them."""
+    """The metrics among `wanted` that any run has; true costs only where a run did not feel all of them."""
 
     def known(name: str) -> bool:
         return any(np.isfinite(run.metrics.get(name, np.nan)).any() for group in shown for run in group.runs)

@@ -115,7 +115,7 @@ def _check(part: Part) -> None:
 
 
 def _word(value: Any) -> str:
-    """A value as it stands in a folder's name: a number the same however it was written."""
+    """A value in the form that a folder's name has: a number the same however it was written."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):

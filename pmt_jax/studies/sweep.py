@@ -53,7 +53,7 @@ ONE_AT_A_TIME = Launch()
 def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains what is missing of the `points` of `parts` (see `train_points`) and says which meet the limit best.
 
-    What was drawn at random stands in draws.json.
+    draws.json holds what was drawn at random.
     """
     with claim(out):
         wanted = missing_programs(points, out, launch.say)
@@ -170,7 +170,7 @@ def _points(folder: pathlib.Path) -> Points:
 
 
 def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
-    """Trains the points of a hidden `folder` side by side, or goes on with it; then each gets its folder in `out`."""
+    """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
     group = _points(folder)
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])

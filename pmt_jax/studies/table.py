@@ -165,6 +165,6 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
 
 
 def _sources(data: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Where reported figures come from that are not the paper's own, each with the first row of a task that has it."""
+    """The sources of reported values that are not the paper's own, each with the first row of a task that has it."""
     rows = [row for row in data if row["paper"]["source"]]
     return {row["paper"]["source"]: row for row in reversed(rows)}

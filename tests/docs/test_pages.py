@@ -1,0 +1,77 @@
+"""What holds for every page of the site: its length, and where its numbers come from."""
+
+from __future__ import annotations
+
+import pathlib
+import re
+
+import pytest
+
+from bench import render
+from places import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+LONG = ("reference", "appendix")  # folders whose pages may be long
+MEASURED = [path for path in PAGES if path.parent.name in ("results", "howto", "start") or path == DOCS / "index.md"]
+NUMBER = r"(?<![\w.,])(?<![\w.]-)(?:(?:\d[\d,]*\d|\d)(?:\.\d+)?|\.\d+)(?!\w)"  # its sign does not count
+
+# Numbers that are no measurements: limits, horizons, settings, equations, years, versions, sizes of the tasks.
+STATED = {
+    "howto/compare.md": "95 2006 2021",
+    "howto/evaluate.md": "95",
+    "howto/export.md": "32",
+    "howto/hosts.md": "64",
+    "howto/limits.md": "17 2020",
+    "howto/pretrained.md": "95",
+    "howto/render.md": "33",
+    "howto/sweep.md": "32",
+    "results/index.md": ".008 50 16 0.78 6.75",  # the lowest p that five seeds against five can have
+    "results/limits.md": "10 3 60 95",
+    "results/table1.md": "1,000 95",
+    "results/table2.md": "2.5 75 256",
+    "results/table3.md": "0.95 1.05 239 64",
+    "start/first_run.md": "95",
+    "start/install.md": "3.11 3.12 3.13",
+}
+
+
+def page(path: pathlib.Path) -> str:
+    return path.relative_to(DOCS).as_posix()
+
+
+def value(number: str) -> float:
+    return float(number.replace(",", ""))
+
+
+def numbers(markdown: str) -> list[str]:
+    """Those of prose and tables, without code and addresses."""
+    prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", markdown, flags=re.DOTALL)
+    return re.findall(NUMBER, re.sub(r"^ *\d+\. ", "", prose, flags=re.MULTILINE))
+
+
+@pytest.mark.parametrize("path", [path for path in PAGES if path.parent.name not in LONG], ids=page)
+def test_a_page_is_short(path: pathlib.Path):
+    assert len(render.BLOCK.sub("", path.read_text()).split()) <= 1500
+
+
+@pytest.mark.parametrize("path", MEASURED, ids=page)
+def test_numbers_come_from_results(path: pathlib.Path):
+    """Every number of a page stands in one of its blocks, perhaps with more digits, or is stated above.
+
+    Outside of the results, whole numbers up to ten are counts of what the page lists.
+    """
+    text = path.read_text()
+    made = {
+        value(x) for block in render.BLOCK.finditer(text) for x in re.findall(r"\d[\d,]*(?:\.\d+)?|\.\d+", block[0])
+    }
+    made |= {value(x) for x in STATED.get(page(path), "").split()}
+    made |= set() if path.parent.name == "results" else set(map(float, range(11)))
+    found = numbers(render.BLOCK.sub("", text))
+    typed = [x for x in found if all(round(y, len(x.partition(".")[2])) != value(x) for y in made)]
+    assert not typed, f"{typed}: make a block of them, or say in STATED why not"
+
+
+def test_what_is_stated_is_needed():
+    for name, stated in STATED.items():
+        assert set(stated.split()) <= set(numbers(render.BLOCK.sub("", (DOCS / name).read_text()))), name
