@@ -1,4 +1,4 @@
-"""`pmt sweep`, `pmt table`, `pmt reproduce`: many runs."""
+"""`pmt sweep`, `pmt table`, `pmt compare`, `pmt reproduce`: many runs."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def add(commands: Any) -> None:
     """Adds the commands."""
     _add_sweep(commands)
     _add_table(commands)
+    _add_compare(commands)
     _add_reproduce(commands)
 
 
@@ -60,6 +61,23 @@ def _add_table(commands: Any) -> None:
     table.add_argument("--test", action="store_true", help="also test against it: Mann-Whitney's U, Holm's correction")
     add_format(table)
     table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
+
+
+def _add_compare(commands: Any) -> None:
+    compare = command(
+        commands,
+        "compare",
+        run_compare,
+        "hold one run against another: pmt compare runs/f4sg runs/mappo_l -o curves.png",
+        description="Reward, cost and seeds within the limit: difference of means and probability of improvement, "
+        "each with its 95 %% interval over seeds.",
+    )
+    for name in ("first", "second"):
+        run = "a run folder, or a folder of runs that differ only in their seeds"
+        compare.add_argument(name, metavar="RUN", type=pathlib.Path, help=run)
+    compare.add_argument(
+        "-o", "--out", type=pathlib.Path, metavar="FILE", help="also draw the curves: .png, .svg, .pdf"
+    )
 
 
 def _add_reproduce(commands: Any) -> None:
@@ -123,6 +141,17 @@ def run_table(arguments: argparse.Namespace) -> int:
         return 0
     with writing(arguments.output) as partial:
         partial.write_text(text)
+    return 0
+
+
+@at_once()
+def run_compare(arguments: argparse.Namespace) -> int:
+    """Prints how two runs differ."""
+    from ..studies import pair
+
+    print(pair.compare(arguments.first, arguments.second, arguments.out), end="")
+    if arguments.out:
+        say(f"wrote {arguments.out}")
     return 0
 
 

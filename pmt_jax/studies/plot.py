@@ -73,9 +73,14 @@ def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = 
     Raises:
       UsageError: a folder that cannot be read, no run at all, another ending, or `out` that cannot be written.
     """
+    check_ending(out)
+    draw(pooled(read_all(folders, note), note), out)
+
+
+def check_ending(out: pathlib.Path) -> None:
+    """Raises UsageError where `out` is no kind of picture."""
     if out.suffix not in ENDINGS:
         raise UsageError(f"cannot write {out}: its ending must be .png, .svg or .pdf")
-    draw(pooled(read_all(folders, note), note), out)
 
 
 def pooled(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:

@@ -47,6 +47,37 @@ def mean_interval(scores: ArrayLike, level: float = LEVEL) -> Interval:
     return float(scores.mean() - half), float(scores.mean() + half)
 
 
+def difference_interval(ours: ArrayLike, theirs: ArrayLike, level: float = LEVEL) -> Interval:
+    """Welch's interval of the mean of `ours` less the mean of `theirs`, scores [seeds] of unequal variances."""
+    sides = [np.asarray(scores, float) for scores in (ours, theirs)]
+    if min(side.size for side in sides) < 2:
+        return math.nan, math.nan
+    middle = float(sides[0].mean() - sides[1].mean())
+    errors = np.array([side.var(ddof=1) / side.size for side in sides])
+    if not errors.any():
+        return middle, middle
+    freedom = errors.sum() ** 2 / sum(error**2 / (side.size - 1) for error, side in zip(errors, sides, strict=True))
+    half = float(scipy.special.stdtrit(freedom, (1 + level) / 2) * errors.sum() ** 0.5)
+    return middle - half, middle + half
+
+
+def share_difference_interval(ours: int, of_ours: int, theirs: int, of_theirs: int, level: float = LEVEL) -> Interval:
+    """The interval of ours / of_ours - theirs / of_theirs, shares of independent seeds.
+
+    Newcombe's tenth method (1998, Statistics in Medicine 17): Wilson's limits of both shares, combined.
+    """
+    z = float(scipy.special.ndtri((1 + level) / 2))
+
+    def wilson(count: int, total: int) -> tuple[float, float, float]:
+        share = count / total
+        half = z * math.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+        middle, scale = share + z**2 / (2 * total), 1 + z**2 / total
+        return share, (middle - half) / scale, (middle + half) / scale
+
+    (p, p_low, p_high), (q, q_low, q_high) = wilson(ours, of_ours), wilson(theirs, of_theirs)
+    return p - q - math.hypot(p - p_low, q_high - q), p - q + math.hypot(p_high - p, q - q_low)
+
+
 def iqm_interval(scores: ArrayLike, level: float = LEVEL) -> Interval:
     """The studentised interval of the interquartile mean of scores [seeds].
 
