@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import html
 import json
 import pathlib
 import re
 import tomllib
 from collections.abc import Callable
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -24,25 +26,17 @@ from pmt_jax.config.settings import HYPER_FIELDS, Config
 from pmt_jax.studies import plot
 from pmt_jax.training.metrics import METRICS
 
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 DOCS = pathlib.Path(__file__).parent
 ROOT = DOCS.parent
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Lists the pages of a folder that the navigation names, `tasks/`; the repository is that of pyproject.toml."""
+    """The repository is that of pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     if repository := project.get("urls", {}).get("Repository"):
         config.repo_url, config.repo_name, config.edit_uri = repository, project["name"], "edit/main/docs/"
-    for section in config.nav or []:
-        ((title, entries),) = section.items()
-        if isinstance(entries, str) and entries.endswith("/"):
-            section[title] = [f"{entries}{path.name}" for path in _pages(DOCS / entries)]
     return config
-
-
-def _pages(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The pages of a folder; the one that introduces the others comes first."""
-    return sorted(folder.glob("*.md"), key=lambda path: (path.stem != "index", path.name))
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -50,6 +44,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, make in PAGES.items():
         files.append(File.generated(config, path, content=make()))
     return files
+
+
+def on_page_content(content: str, **_: object) -> str:
+    """Formulas as MathML, which browsers draw without a script."""
+
+    def formula(found: re.Match[str]) -> str:
+        return convert(html.unescape(found[3]), display="block" if found[2] == "[" else "inline")
+
+    return FORMULA.sub(formula, content)
 
 
 def settings() -> str:

@@ -6,68 +6,84 @@ python -m docs.figures.study
 from __future__ import annotations
 
 import pathlib
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records, runs, study
-from pmt_jax.studies.plot import METHOD_COLOURS
+from pmt_jax.studies.plot import INK, METHOD_COLOURS
 from pmt_jax.studies.statistics import mean_interval
 
+from . import style
+
 DOCS = pathlib.Path(__file__).parents[1]
-PANELS = {"end": "true cost of an episode at the end", "reward": "reward of an episode at the end"}
+PANELS = {"end": "true cost of an episode", "reward": "reward of an episode"}
+SHOWN = ("mappo_l", "f4sg", "r4sg", "mixed", "macpo")
+# Where a method's name stands beside its last mark in either panel: points to the right and up, and its alignment.
+PLACES = {
+    "end": {"r4sg": (-4, 10, "right"), "mixed": (-6, -11, "right"), "macpo": (-9, 0, "right")},
+    "reward": {"r4sg": (-8, -12, "right"), "mixed": (-9, 0, "right"), "macpo": (-9, 6, "right")},
+}
 
 
 def draw(found: list[runs.Run], file: pathlib.Path) -> None:
     """Two panels: means over seeds with 95 % intervals, one line a method; other starts of lambda are open marks."""
-    figure = Figure(figsize=(9.5, 3.9), layout="constrained")
-    for axis, (name, title) in zip(figure.subplots(1, 2), PANELS.items(), strict=True):
-        for method in ("mappo_l", "f4sg", "r4sg", "mixed", "macpo"):
-            _line(axis, [run for run in found if run["method"] == method], name)
-        axis.set(xscale="log", xlabel="share of costly steps that are felt, p", title=title)
-        axis.set_xticks([0.01, 0.03, 0.1, 1], ["0.01", "0.03", "0.1", "1"])
-        axis.invert_xaxis()
-        axis.spines[["top", "right"]].set_visible(False)
-        if name == "end":
-            axis.set(yscale="log")
-            axis.set_yticks([3, 10, 30, 100], ["3", "10", "30", "100"])
-            axis.axhline(10, color="#808182", linewidth=1, linestyle="--")
-            axis.text(0.4, 8.6, "limit", color="#808182", fontsize=8)
-        else:
-            axis.legend(frameon=False, fontsize=8, loc="lower left")
-    figure.savefig(file, dpi=140)
+    with rc_context(style.FONT):
+        figure = Figure(figsize=(10, 4.4), layout="constrained")
+        for axis, (name, title) in zip(figure.subplots(1, 2), PANELS.items(), strict=True):
+            for method in SHOWN:
+                _line(axis, [run for run in found if run["method"] == method], name)
+            axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
+            axis.set(xscale="log", xlabel="probability that a costly step is felt")
+            axis.set_xticks([0.01, 0.03, 0.1, 1], ["0.01", "0.03", "0.1", "1"])
+            axis.set_xlim(1.25, 0.0045)
+            if name == "end":
+                axis.set(yscale="log")
+                axis.set_yticks([3, 10, 30, 100], ["3", "10", "30", "100"])
+                axis.axhline(10, color=INK, lw=1.2, ls="--")
+                axis.text(0.36, 10.2, "limit 10", color=INK, fontsize=9, va="bottom")
+        seeds = len(found[0]["seeds"])
+        figure.suptitle(
+            f"ant_2x4 at the end: mean of {seeds} seeds, bars: 95 % interval", x=0.01, ha="left", fontsize=11
+        )
+        figure.savefig(file, dpi=110)
 
 
-def _line(axis: Axes, cells: list[runs.Run], name: str) -> None:
-    """One method's cells; of MAPPO-Lagrangian those with another start of lambda by themselves."""
-    cells = sorted(cells, key=lambda run: runs.curves(run).settings["cost_seen"])
+def _line(axis: Any, cells: list[runs.Run], name: str) -> None:
+    """One method's cells with its name; of MAPPO-Lagrangian those with another start of lambda by themselves."""
+    cells = sorted(cells, key=lambda run: -runs.curves(run).settings["cost_seen"])
     method = cells[0]["method"]
+    colour = METHOD_COLOURS[method]
     usual = [run for run in cells if runs.curves(run).settings["lambda_init"] == 2]
-    for group, marker, label in ((usual, "o", study.NAMES[method]), ([c for c in cells if c not in usual], "s", None)):
-        aside = 1.05 ** (list(study.NAMES).index(method) - 2)  # so that intervals do not hide each other
+    aside = 1.05 ** (SHOWN.index(method) - 2)  # so that intervals do not hide each other
+    for group, marker in ((usual, "o"), ([cell for cell in cells if cell not in usual], "s")):
         shares = [runs.curves(run).settings["cost_seen"] * aside for run in group]
         scores = [study.measures(run)[name] for run in group]
         middle = np.array([x.mean() for x in scores])
         ends = np.array([mean_interval(x) for x in scores]).reshape(-1, 2).T
-        errors = np.abs(ends - middle) if len(group) else None
         axis.errorbar(
             shares,
             middle,
-            errors,
-            color=METHOD_COLOURS[method],
+            np.abs(ends - middle) if len(group) else None,
+            color=colour,
             marker=marker,
-            markersize=5,
+            markersize=6,
             markerfacecolor="none" if marker == "s" else None,
             linestyle="-" if marker == "o" else "none",
+            lw=2,
             capsize=2,
-            label=label,
         )
-    for run, x in zip(cells, (study.measures(run)[name].mean() for run in cells), strict=True):
-        settings = runs.curves(run).settings
-        if settings["lambda_init"] != 2:
-            text = f"lambda from {settings['lambda_init']:g}"
-            axis.annotate(text, (settings["cost_seen"], x), xytext=(6, -3), textcoords="offset points", fontsize=7)
+        for run, x, y in zip(group, shares, middle, strict=True):
+            if marker == "s":
+                text = f"multiplier from {runs.curves(run).settings['lambda_init']:g}"
+                axis.annotate(text, (x, y), (9, 0), textcoords="offset points", color=colour, va="center", fontsize=8)
+            elif run is group[-1]:
+                *xytext, side = PLACES[name].get(method, (9, 0, "left"))
+                text = style.NAMES[method]
+                at = {"textcoords": "offset points", "ha": side, "va": "center"}
+                axis.annotate(text, (x, y), xytext, color=colour, fontweight="bold", **at)
 
 
 if __name__ == "__main__":
