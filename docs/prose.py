@@ -32,6 +32,7 @@ NO_PROSE = (
     r"\$[^$\n]+\$",
     r"<!--.*?-->",
     r"\]\([^)]*\)",
+    r'"[^"\n]*"',  # quoted, as the examples of CONTRIBUTING.md
 )
 
 

@@ -19,6 +19,7 @@ import envs
 from envs.voltage.baselines import POLICIES, Policy
 from envs.voltage.control import VoltageControl
 from envs.voltage.profiles import ROWS_PER_DAY
+from pmt_jax.studies.plot import BLUE, RED
 
 
 def day_of_voltages(env: VoltageControl, policy: Policy, start_row: int) -> np.ndarray:
@@ -50,7 +51,7 @@ def draw(env: VoltageControl, before: np.ndarray, after: np.ndarray, policy: str
     worst = int(np.abs(before - 1).max(axis=1).argmax())
     figure, (feeder, day) = pyplot.subplots(1, 2, figsize=(10, 3.6), sharey=True, width_ratios=(1, 1.3))
     hours = np.arange(ROWS_PER_DAY) / 20
-    for voltages, colour, name in ((before, "#c44e52", "no control"), (after, "#2a6f97", policy)):
+    for voltages, colour, name in ((before, RED, "no control"), (after, BLUE, policy)):
         for bus, parent in enumerate(table["parent"]):
             if parent >= 0:
                 feeder.plot(far[[parent, bus]], voltages[worst, [parent, bus]], color=colour, lw=1.2)

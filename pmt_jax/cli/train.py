@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
     output.add_argument("--out", type=pathlib.Path, metavar="DIR", help="the run folder (default: a new one in runs/)")
     output.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     output.add_argument(
-        "--change", action="store_true", help="with --resume: go on with other settings than the run began with"
+        "--change", action="store_true", help="with --resume: continue with settings other than those of the run"
     )
     output.add_argument(
         "--sink",

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..studies import plot
 from .encode import to_base64
 from .episode import Episode
 
@@ -20,7 +21,9 @@ RATE = 20.0  # control steps that a replay shows a second
 
 def page(title: str, body: Iterable[str]) -> str:
     """A whole HTML document."""
-    style, script = _asset("page.css"), _asset("replay.js")
+    accents = f":root {{ --accent-light: {plot.BLUE}; --accent-dark: {plot.SKY}; }}\n"  # the colours of all figures
+    style = accents + _asset("page.css")
+    script = f"const LINES = {json.dumps(plot.OTHER_COLOURS)};\n{_asset('replay.js')}"
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'

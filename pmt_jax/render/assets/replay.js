@@ -144,7 +144,6 @@ function unpackArray(text, type) {
 
 // ------------------------------------------------------------------------------------------------ a task without a picture
 
-const LINES = ["#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#7f7f7f"]; // as in studies/plot.py
 
 function plainView(canvas, data) {
   const panels = data.panels, last = Math.max(1, data.reward.length - 1);
