@@ -55,9 +55,13 @@ def joints(model: mujoco.MjModel, unseen: int) -> Blocks:
         speeds += [Block("torso spin", 3, "rad/s", "the torso's own frame")]
     else:
         root = 3
-        units = ["rad" if kind == mujoco.mjtJoint.mjJNT_HINGE else "m" for kind in model.jnt_type[:root]]
-        places = [Block(name, 1, unit) for name, unit in zip(names[:root], units, strict=True)][unseen:]
-        speeds = [Block(f"{name} velocity", 1, f"{unit}/s") for name, unit in zip(names[:root], units, strict=True)]
+        places, speeds = [], []
+        for name, kind, axis in zip(names[:root], model.jnt_type, model.jnt_axis, strict=False):
+            unit, how = ("rad", "about") if kind == mujoco.mjtJoint.mjJNT_HINGE else ("m", "along")
+            meaning = f"of the torso, {how} {'xyz'[abs(axis).argmax()]}"
+            places.append(Block(name, 1, unit, meaning))
+            speeds.append(Block(f"{name} velocity", 1, f"{unit}/s", meaning))
+        places = places[unseen:]
     hinges = names[root:]
     angles = Block("joint angles", len(hinges), "rad", ", ".join(hinges))
     return (*places, angles, *speeds, Block("joint velocities", len(hinges), "rad/s", "in the same order"))
