@@ -13,7 +13,11 @@ from places import ROOT
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 LONG = ("reference", "appendix")  # folders whose pages may be long
-MEASURED = [path for path in PAGES if path.parent.name in ("results", "howto", "start") or path == DOCS / "index.md"]
+MEASURED = [
+    path
+    for path in PAGES
+    if path.parent.name in ("results", "howto", "start", "tasks", "methods") or path == DOCS / "index.md"
+]
 NUMBER = r"(?<![\w.,])(?<![\w.]-)(?:(?:\d[\d,]*\d|\d)(?:\.\d+)?|\.\d+)(?!\w)"  # its sign does not count
 
 # Numbers that are no measurements: limits, horizons, settings, equations, years, versions, sizes of the tasks.
@@ -26,6 +30,14 @@ STATED = {
     "howto/pretrained.md": "95",
     "howto/render.md": "33",
     "howto/sweep.md": "32",
+    "methods/happo.md": "2022",
+    "methods/index.md": "12 2016",
+    "methods/macpo.md": "2017 2023",
+    "methods/mappo.md": "2022",
+    "methods/mappo_l.md": "11 16 17 2020 2023",
+    "methods/mixed.md": "15",
+    "methods/protection_motivation.md": "11 13 14 91 1975 2010",
+    "methods/r4sg.md": "14 15 16 17",
     "results/index.md": ".008 50 16 0.78 6.75",  # the lowest p that five seeds against five can have
     "results/limits.md": "10 3 60 95",
     "results/table1.md": "1,000 95",
@@ -33,6 +45,11 @@ STATED = {
     "results/table3.md": "0.95 1.05 239 64",
     "start/first_run.md": "95",
     "start/install.md": "3.11 3.12 3.13",
+    "tasks/ant.md": "0.0005 0.01 0.05 0.5 1.4 20 50 60 100 134 150 600 2023",
+    "tasks/hand_over.md": "0.2 0.5 25 60 120 500 567 2023",
+    "tasks/toys.md": "0.1 0.2 0.3 16.36 18.85 24.561 95",
+    "tasks/velocity.md": "0.0001 0.001 0.04891 0.2 0.4 0.5 0.78 0.9613 1.25 1.641 2.3 2.418 2.522 2.932 3.17 3.227",
+    "tasks/voltage.md": "0.6 0.8 1.2 64 322 1547 2021 2110.14300",
 }
 
 
