@@ -20,7 +20,7 @@ Scores = NDArray[np.float64]  # [seeds]
 
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 SHOWN = {"lambda_init": "lambda from {}", "emotion_lr": "`emotion_lr` {}", "fear_start": "`fear_start` {}"}
-SHOWN |= {"regret_response": "`{}`"}
+SHOWN |= {"regret_response": "`{}`", "lambda_kp": "`lambda_kp` {}"}
 LAST = 0.1  # share of the steps that count as the end
 
 
@@ -159,6 +159,83 @@ def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
     return float(x.mean() - y.mean()), float(scipy.special.stdtrit(freedom, (1 + level) / 2) * (a + b) ** 0.5)
 
 
+def as_second(file: pathlib.Path) -> str:
+    """The second round: a row a cell; p corrected over the comparisons of one task with F4SG as it is."""
+    found, last = _by_task(file)
+    body = []
+    for task in last:
+        cells = [run for run in found if run["task"] == task]
+        scores = [measures(run, last[task]) for run in cells]
+        pairs = [(i, _as_it_is(cells, run)) for i, run in enumerate(cells) if run["method"] == "mappo_l"]
+        p = holm([u_test(scores[i]["end"], scores[j]["end"]) for i, j in pairs])
+        corrected = {i: value for (i, _), value in zip(pairs, p, strict=True)}
+        for i, (run, own) in enumerate(zip(cells, scores, strict=True)):
+            base = _baseline(run, cells)
+            less = "-" if base is None or base is run else _difference(own, measures(base, last[task]))
+            unsafe = (own["end"] > run["cost_limit"] / _share(run)).sum()
+            line = [task, f"{_share(run):g}", label(run, [x for x in cells if _share(x) == _share(run)])]
+            line += [_mean_sd(own["end"]), _mean_sd(own["training"]), less, _mean_sd(own["reward"])]
+            body.append([*line, f"{unsafe} of {len(own['end'])}", _p(corrected[i]) if i in corrected else "-"])
+    head = ["task", "p", "method", "true cost at the end", "true cost per 1,000 steps, training"]
+    head += ["less MAPPO-L's [95 %]", "reward", "unsafe seeds", "corrected p, F4SG's cost at the end"]
+    return markdown(head, body)
+
+
+def as_candidate(file: pathlib.Path) -> str:
+    """Question b again: each criterion of the preregistration, what was measured, and whether it holds."""
+    found, last = _by_task(file)
+
+    def cell(task: str, share: float, **settings: Any) -> dict[str, Scores]:
+        settings = {"method": "f4sg", "cost_seen": share, **settings}
+        same = [
+            x
+            for x in found
+            if x["task"] == task and {**_settings(x), **runs.curves(x).settings}.items() >= settings.items()
+        ]
+        return measures(same[0], last[task])
+
+    body = []
+    for task in ("voltage_33", "hand_over_2x6"):
+        candidate, base = cell(task, 1.0, emotion_lr=0.01), cell(task, 1.0, method="mappo_l")
+        middle, half = welch(candidate["training"], base["training"])
+        text = f"{middle:+.1f} [{middle - half:.1f}, {middle + half:.1f}]"
+        body.append(
+            ["1", f"true cost while training, less MAPPO-L's, `{task}`, p = 1", text, middle < 1 and middle + half < 5]
+        )
+    for task, share in (("ant_2x4", 0.03), ("voltage_33", 0.05)):
+        candidate, usual = cell(task, share, emotion_lr=0.01), cell(task, share, emotion_lr=0.001)
+        base = cell(task, share, method="mappo_l", lambda_kp=0.0)
+        at = f"`{task}`, p = {share:g}"
+        ends = [_mean_sd(x["end"]) for x in (candidate, usual, base)]
+        above = u_test(candidate["end"], usual["end"])
+        worse = above < 0.05 and probability_of_improvement([candidate["end"]], [usual["end"]]) < 0.5
+        body.append(
+            ["2", f"true cost at the end beside F4SG's, {at}", f"{ends[0]}; {ends[1]}; p {_p(above)}", not worse]
+        )
+        below = u_test(candidate["end"], base["end"])
+        body.append(
+            ["2", f"true cost at the end below MAPPO-L's, {at}", f"{ends[0]}; {ends[2]}; p {_p(below)}", below < 0.01]
+        )
+        rewards = candidate["reward"].mean(), usual["reward"].mean()
+        least = 0.9 * rewards[1] if task == "ant_2x4" else rewards[1] - usual["reward"].std(ddof=1)
+        text = f"{_mean_sd(candidate['reward'])}; at least {least:.{0 if task == 'ant_2x4' else 2}f}"
+        body.append(["3", f"reward at the end, {at}", text, rewards[0] >= least])
+    body = [[*line, "yes" if holds else "**no**"] for *line, holds in sorted(body, key=lambda line: line[0])]
+    return markdown(["criterion", "measure", "candidate C", "holds"], body)
+
+
+def _by_task(file: pathlib.Path) -> tuple[list[runs.Run], dict[str, float]]:
+    """The cells in order, and of each task the last step that all of its cells reached."""
+    found = sorted(runs.load(file), key=lambda run: (run["task"], -_share(run), -list(NAMES).index(run["method"])))
+    return found, {x["task"]: min(max(run["steps"]) for run in found if run["task"] == x["task"]) for x in found}
+
+
+def _as_it_is(cells: Sequence[runs.Run], run: runs.Run) -> int:
+    """F4SG's cell with default settings at the p of `run`."""
+    usual = ("f4sg", _share(run), Config.emotion_lr)
+    return next(i for i, x in enumerate(cells) if (x["method"], _share(x), _settings(x)["emotion_lr"]) == usual)
+
+
 def as_equivalence(file: pathlib.Path) -> str:
     """Question c, first part: R4SG less MAPPO-L at p = 1, beside half of MAPPO-L's standard deviation."""
     cells = {run["method"]: measures(run) for run in runs.load(file) if _share(run) == 1}
@@ -219,6 +296,8 @@ def _p(value: float) -> str:
 FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "study": as_study,
     "lag": as_lag,
+    "second": as_second,
+    "candidate": as_candidate,
     "equivalence": as_equivalence,
     "weights": as_weights,
     "headline": as_headline,

@@ -69,3 +69,24 @@ def test_welch_is_scipys():
     expected = scipy.stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
     middle, half = welch(x, y)
     assert (middle - half, middle + half) == pytest.approx((expected.low, expected.high))
+
+
+def test_the_second_round_names_each_criterion_that_does_not_hold(tmp_path: pathlib.Path):
+    """Candidate C: as cheap as MAPPO-L while training, too costly at the end on the grid."""
+
+    def cells(task: str, share: float, candidate: float, usual: float, base: float) -> list[dict]:
+        fear = {"emotion_lr": 0.01, "lambda_kp": 0.0}
+        runs = [("f4sg", candidate, fear), ("f4sg", usual, fear | {"emotion_lr": 0.001}), ("mappo_l", base, fear)]
+        found = [stored(method, share, list(x + np.linspace(0, 0.5, 12)), **more) for method, x, more in runs]
+        return [run | {"task": task} for run in found]
+
+    file = tmp_path / "x.json"
+    every = cells("voltage_33", 1.0, 2, 3, 2) + cells("hand_over_2x6", 1.0, 2, 3, 2)
+    every += cells("ant_2x4", 0.03, 2, 2, 9) + cells("voltage_33", 0.05, 4, 2, 9)
+    file.write_text(json.dumps(every))
+    rows = [line.strip("| ").split(" | ") for line in study.as_candidate(file).splitlines()[2:]]
+    assert [(row[0], row[-1]) for row in rows if "no" in row[-1]] == [("2", "**no**")]
+    assert "voltage_33" in next(row[1] for row in rows if "no" in row[-1])
+    assert len(rows) == 8
+    lines = [line.split("|") for line in study.as_second(file).splitlines()[2:]]
+    assert [line[-2].strip() != "-" for line in lines] == [line[3].strip() == "MAPPO-L" for line in lines]
