@@ -208,7 +208,7 @@ def as_candidate(file: pathlib.Path) -> str:
         at = f"`{task}`, p = {share:g}"
         ends = [_mean_sd(x["end"]) for x in (candidate, usual, base)]
         above = u_test(candidate["end"], usual["end"])
-        worse = above < 0.05 and probability_of_improvement([candidate["end"]], [usual["end"]]) < 0.5
+        worse = above < 0.05 and probability_of_improvement([candidate["end"]], [usual["end"]]) > 0.5
         body.append(
             ["2", f"true cost at the end beside F4SG's, {at}", f"{ends[0]}; {ends[1]}; p {_p(above)}", not worse]
         )
