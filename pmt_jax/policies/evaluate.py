@@ -40,7 +40,7 @@ def evaluate_run(
       deterministic: take mean actions instead of samples.
       which: `last` or `best`.
       physics: an engine other than the run's.
-      save: an .npz file for every step of every episode (docs/runs.md lists its arrays).
+      save: an .npz file for every step of every episode (docs/howto/evaluate.md lists its arrays).
 
     Raises:
       UsageError: there is no such run, the physics lost contacts, or `save` cannot be written.
