@@ -79,5 +79,11 @@ def test_every_file_describes_itself():
 
 def test_all_files_are_packaged():
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    packaged = {path for pattern in patterns["pmt_jax.configs"] for path in toml.CONFIG_DIR.glob(pattern)}
+    folders = {"": "pmt_jax.configs", "paper": "pmt_jax.configs.paper", "presets": "pmt_jax.configs.presets"}
+    packaged = {
+        path
+        for folder, package in folders.items()
+        for pattern in patterns[package]
+        for path in (toml.CONFIG_DIR / folder).glob(pattern)
+    }
     assert packaged == {path for path in toml.CONFIG_DIR.rglob("*") if path.is_file()}
