@@ -1,4 +1,4 @@
-"""`pmt doctor`: what of this machine pmt-jax can use, and why not the rest."""
+"""`pmt doctor`: checks what pmt-jax can use on this machine, and gives the reason for the rest."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Finding(NamedTuple):
 
 def add(commands: Any) -> None:
     """Adds the command."""
-    command(commands, "doctor", run, "what of this machine can be used, and why not the rest")
+    command(commands, "doctor", run, "check versions, devices, engines and packages of this machine")
 
 
 @at_once()

@@ -131,7 +131,7 @@ def add_jobs(parser: Any) -> None:
         type=whole(1),
         default=1,
         metavar="N",
-        help="programs that train at a time, for a GPU that one does not fill",
+        help="programs that train at a time; for a GPU that one program does not fill",
     )
     add_devices(parser)
     add_cache(parser)

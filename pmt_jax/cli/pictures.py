@@ -17,7 +17,7 @@ def add(commands: Any) -> None:
         commands,
         "render",
         run_render,
-        "see an episode of a run: pmt render runs/x -o x.html (or .gif, .mp4)",
+        "play an episode of a run: pmt render runs/x -o x.html (or .gif, .mp4)",
         description="Plays one episode and writes it as a film, or as a page that replays it in any browser.",
     )
     render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help=RUN)

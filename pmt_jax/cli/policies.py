@@ -53,7 +53,7 @@ def add(commands: Any) -> None:
     add_which(export)
     add_trust(export)
 
-    command(commands, "hub", run_hub, "list the pretrained policies, and how good they are")
+    command(commands, "hub", run_hub, "list the pretrained policies with their evaluations")
 
 
 @at_once()

@@ -42,7 +42,7 @@ def _add_sweep(commands: Any) -> None:
         "or with --random a range: NAME=LOW:HIGH, NAME=log:LOW:HIGH",
     )
     sweep.add_argument("--random", type=whole(0), default=0, metavar="N", help="draw N values from each range of --set")
-    sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="of these draws (default 0)")
+    sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="seed of these draws (default 0)")
     sweep.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR", help="gets a run folder per point")
     add_jobs(sweep)
     add_settings(sweep)
@@ -53,14 +53,18 @@ def _add_table(commands: Any) -> None:
         commands,
         "table",
         run_table,
-        "compare runs, with intervals over seeds, beside the paper's numbers: pmt table runs/*",
+        "compare runs with intervals over seeds, next to the paper's numbers: pmt table runs/*",
         description="One row per task, method and settings: interquartile means with 95 % intervals.",
     )
     table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
-    table.add_argument("--test", action="store_true", help="also test against it: Mann-Whitney's U, Holm's correction")
+    table.add_argument(
+        "--test",
+        action="store_true",
+        help="also print p values against the baseline: Mann-Whitney U, Holm's correction",
+    )
     add_format(table)
-    table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="write it there")
+    table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="also write the table to this file")
 
 
 def _add_compare(commands: Any) -> None:
@@ -85,7 +89,7 @@ def _add_reproduce(commands: Any) -> None:
         commands,
         "reproduce",
         run_reproduce,
-        "run what is missing for a table of the paper and print it: pmt reproduce table1",
+        "train the missing runs of a table of the paper and print it: pmt reproduce table1",
         description="The same command continues where it was interrupted.",
     )
     reproduce.add_argument("table", metavar="TABLE", help="table1 | table2 | table3 | fig4 | velocity")

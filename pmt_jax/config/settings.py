@@ -83,27 +83,33 @@ class Hyper:
     )
     cost_margin: float = constraint(
         0.0,
-        "share of the limit that the learner keeps clear of: it holds costs to (1 - cost_margin) * cost_limit, and is "
-        "judged by cost_limit",
+        "safety margin, a share of the limit: the learner holds costs to (1 - cost_margin) * cost_limit; tables use "
+        "cost_limit",
         Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
     )
     cost_seen: float = constraint(
         1.0,
-        "probability that a costly step is felt by the learner; the task's own limit is scaled with it",
+        "probability that the learner notices the cost of a costly step; it scales the task's own limit, too",
         Bound("be a probability above 0", lambda x: 0 < x <= 1),
     )
     cost_false: float = constraint(
-        0.0, "probability that a safe step is felt as costly", Bound("lie in [0, 1)", lambda x: 0 <= x < 1)
+        0.0,
+        "probability that the learner takes a safe step for a costly one",
+        Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
     )
     lambda_init: float = constraint(0.78, "multiplier before the first update", NOT_NEGATIVE)
     lambda_lr: float = constraint(
         0.1, "step of the multiplier per update, for an excess in cost per step", NOT_NEGATIVE
     )
     lambda_kp: float = constraint(
-        0.0, "with lambda_rule = pid, added to the multiplier for an excess of 1 in cost per step", NOT_NEGATIVE
+        0.0,
+        "with lambda_rule = pid: weight of the excess (cost per step) that is added to the multiplier",
+        NOT_NEGATIVE,
     )
     lambda_kd: float = constraint(
-        0.0, "with lambda_rule = pid, added for an excess that has risen by 1 since the last update", NOT_NEGATIVE
+        0.0,
+        "with lambda_rule = pid: weight of the rise of the excess since the last update, added as well",
+        NOT_NEGATIVE,
     )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
     surrogate_weight: float = constraint(
@@ -126,15 +132,15 @@ class Hyper:
         1.0, "weight of fear's squared change since collection (its cognitive error)", NOT_NEGATIVE
     )
     regret_l2: float = emotion(1.0, "weight of regret's squared change since collection", NOT_NEGATIVE)
-    temperature: float = emotion(0.5, "of the relaxed samples of the gumbel fear losses", POSITIVE)
+    temperature: float = emotion(0.5, "temperature of the relaxed samples of the gumbel fear losses", POSITIVE)
     omega: float = emotion(
         0.5,
-        "share of an action's entries whose regret counts, or the threshold of regret from which it counts",
+        "regret_mask = top: the share of an action's entries that count; threshold: the least regret that counts",
         NOT_NEGATIVE_OR_INF,
     )
     regret_max: float = emotion(
         0.9,
-        "upper bound of regret; where it weighs on the cost advantage, by at most 1 / (1 - regret_max)",
+        "upper bound of regret; with regret_response = advantage the weight is at most 1 / (1 - regret_max)",
         Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
     )
     kappa: float = emotion(
@@ -169,9 +175,7 @@ class Config(Hyper):
     seed: int = common(
         0, "the first seed; the others count up from it. Runs are bitwise reproducible per seed, except with warp"
     )
-    init: str = common(
-        "", "a run folder or a pretrained policy; the run starts from its networks and running moments (empty: anew)"
-    )
+    init: str = common("", "run folder or pretrained policy; the run starts from its networks and running moments")
     num_envs: int = sizes(64, "environments per seed, B", COUNT)
     rollout_length: int = sizes(64, "control steps of each environment between updates, T", COUNT)
     epochs: int = sizes(5, "passes over the batch per update, for actors and critics", COUNT)
@@ -181,7 +185,7 @@ class Config(Hyper):
         "widths of the hidden layers of every network",
         Bound("name at least one layer of at least one unit", lambda x: x and 1 <= min(x) and max(x) <= INT32_MAX),
     )
-    activation: Literal["relu", "tanh", "elu"] = sizes("relu", "of the hidden layers")
+    activation: Literal["relu", "tanh", "elu"] = sizes("relu", "activation function of the hidden layers")
     layer_norm: bool = sizes(True, "layer normalisation after each hidden layer")
     obs_norm: Literal["running", "layernorm", "none"] = learning(
         "running", "observations are scaled by running moments, by layer normalisation, or not at all"
@@ -198,13 +202,13 @@ class Config(Hyper):
     )
     lambda_unit: Literal["step", "limit"] = constraint(
         "step",
-        "unit of the excesses that move the multiplier: cost per step, or the limit itself, cut at 1: an excess of a "
-        "tenth of the limit moves it alike at all limits and horizons",
+        "unit of the excess that changes the multiplier: cost per step, or share of the limit, cut at 1, so that one "
+        "lambda_lr fits all limits and horizons",
     )
     lambda_rule: Literal["integral", "pid"] = constraint(
         "integral",
-        "the multiplier sums up excesses, each times lambda_lr, or lambda_kp and lambda_kd add what the excess is now "
-        "and how it rises (PID-Lagrangian)",
+        "integral: the multiplier sums the excesses times lambda_lr; pid: lambda_kp times the current excess and "
+        "lambda_kd times its rise are added (PID-Lagrangian)",
     )
     cost_advantage: Literal["std", "center"] = constraint(
         "std", "cost advantages in the policy's loss are standardised (with a floor) or only centred"
@@ -216,21 +220,21 @@ class Config(Hyper):
         "ce", "cross entropy, or relaxed samples with the divergence from the observed cost forward or reversed"
     )
     fear_history: Literal["rollout", "random"] = emotion(
-        "rollout", "remembered fear from which fear's change is measured: of the same state or a random one"
+        "rollout", "earlier fear that the change of fear is measured from: of the same state or of a random one"
     )
     regret_mask: Literal["top", "threshold", "none"] = emotion(
-        "top", "action entries that count: the share omega with most regret, those from omega on, or all"
+        "top", "action entries that count: the share omega with the most regret, those of at least omega, or all"
     )
     regret_target: Literal["mode", "tail"] = emotion(
         "mode", "how deliberate an action was: density relative to the mode, or tail probability"
     )
     regret_response: Literal["letter", "one_sided", "advantage"] = emotion(
         "letter",
-        "what regret does to the ratio: as in the paper (its change weighs on it), one-sided (regret itself weakens "
-        "what would repeat the action and strengthens what avoids it), or it weighs on the cost advantage instead",
+        "letter: the change of regret weights the ratio, as in the paper; one_sided: regret itself weakens updates "
+        "that repeat the action and strengthens those that avoid it; advantage: regret weights the cost advantage",
     )
     init_fear: str = emotion(
-        "", "a run folder whose fear the run starts from, as a prior; agents of another team begin with its mean"
+        "", "run folder whose fear network is the start, as a prior; agents of another team start with its mean"
     )
     emotion_epochs: int = emotion(4, "passes over the batch for the fear and regret networks", COUNT)
     trust_steps: int = constraint(
@@ -248,7 +252,7 @@ class Config(Hyper):
         "updates between evaluations under mean actions, rounded up to whole rows; 0 for none",
         Bound("be a number of updates, or 0 for none", lambda x: 0 <= x <= INT32_MAX),
     )
-    eval_episodes: int = output(32, "episodes per seed of such an evaluation", COUNT)
+    eval_episodes: int = output(32, "episodes per seed of an evaluation during training", COUNT)
 
     def __post_init__(self) -> None:
         if math.isnan(self.surrogate_weight):
