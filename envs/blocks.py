@@ -58,7 +58,7 @@ def joints(model: mujoco.MjModel, unseen: int) -> Blocks:
         places, speeds = [], []
         for name, kind, axis in zip(names[:root], model.jnt_type, model.jnt_axis, strict=False):
             unit, how = ("rad", "about") if kind == mujoco.mjtJoint.mjJNT_HINGE else ("m", "along")
-            meaning = f"of the torso, {how} {'xyz'[abs(axis).argmax()]}"
+            meaning = f"{how} {'xyz'[abs(axis).argmax()]}"
             places.append(Block(name, 1, unit, meaning))
             speeds.append(Block(f"{name} velocity", 1, f"{unit}/s", meaning))
         places = places[unseen:]
