@@ -13,7 +13,9 @@ import pathlib
 import re
 import tomllib
 from collections.abc import Callable
+from typing import Any
 
+import griffe
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -53,6 +55,20 @@ def on_page_content(content: str, **_: object) -> str:
         return convert(html.unescape(found[3]), display="block" if found[2] == "[" else "inline")
 
     return FORMULA.sub(formula, content)
+
+
+class SeveralNames(griffe.Extension):
+    """Gives each name of an entry like `terminated, truncated: [T, B] bool` in a docstring an entry of its own."""
+
+    ENTRY = re.compile(r"^( +)(\w+(?:, \w+)+): (.*(?:\n\1 +\S.*)*)$", re.MULTILINE)
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Changes the docstring before it is parsed."""
+        if obj.docstring:
+            obj.docstring.value = self.ENTRY.sub(
+                lambda found: "\n".join(f"{found[1]}{name}: {found[3]}" for name in found[2].split(", ")),
+                obj.docstring.value,
+            )
 
 
 def settings() -> str:
@@ -107,6 +123,7 @@ def commands() -> str:
 def _help(parser: argparse.ArgumentParser) -> str:
     for group in parser._action_groups:
         group._group_actions = [a for a in group._group_actions if not a.dest.startswith("set_")]
+    parser._action_groups = [group for group in parser._action_groups if group._group_actions]
     parser.formatter_class = lambda prog: argparse.HelpFormatter(prog, width=100)
     return f"```text\n{parser.format_help().strip()}\n```"
 

@@ -65,7 +65,7 @@ def make(name: str, **options: Any) -> Env:
       TaskError: unknown name or option (the nearest known one is named), an engine that cannot run here, or a file
         that does not keep the contract.
 
-    Example:
+    Examples:
       >>> make("lane").spec.num_agents
       2
     """

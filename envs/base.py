@@ -3,7 +3,7 @@
 An environment is a value with a `spec`, the name of its `engine`, and two pure functions, `reset` and `step`. It never
 resets itself and has no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("lane")
   >>> state = env.reset(jax.random.key(0))

@@ -61,7 +61,7 @@ class VectorEnv:
       limit_terminates: an episode that reaches the horizon counts as terminated, as it does in SafePO and others of its
         family, so that nothing bootstraps from what comes after.
 
-    Example:
+    Examples:
       >>> import envs, jax
       >>> vector = VectorEnv(envs.make("lane"), num_envs=4)
       >>> state = vector.reset(jax.random.key(0))

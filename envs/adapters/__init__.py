@@ -2,7 +2,7 @@
 
 The library is imported when its adapter is first asked for (`pip install "pmt-jax[adapters]"` brings all three).
 
-Example:
+Examples:
   >>> import envs
   >>> vector = to_gymnasium(envs.make("lane"), num_envs=3)
   >>> obs, info = vector.reset(seed=0)

@@ -4,7 +4,7 @@ One ant of eight motors, shared out among 2 or 4 agents, runs along +x between t
 Written from the facts of the public reference code and checked against transitions recorded from it. Where paper and
 code differ, the task follows the code.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("ant_2x4")
   >>> state = jax.jit(env.reset)(jax.random.key(0))

@@ -13,7 +13,7 @@ throwing hand's index finger: the cost is a function of the action alone, which 
 
 Written from the facts of the public reference task; `docs/tasks/hand_over.md` lists what differs from Isaac Gym.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("hand_over_2x6")
   >>> state = jax.jit(env.reset)(jax.random.key(0))

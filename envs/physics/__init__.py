@@ -8,7 +8,7 @@
 
 Signatures are those of one environment; batches come from `jax.vmap`, nested as one likes.
 
-Example:
+Examples:
   >>> import jax, mujoco
   >>> from envs import physics
   >>> ball = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"

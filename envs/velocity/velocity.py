@@ -14,7 +14,7 @@
 Written from the facts of the public reference and checked against transitions recorded from it; `robots.py` holds what
 tells the robots apart, `docs/tasks/velocity.md` what differs from SafePO.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("velocity_half_cheetah_2x3")
   >>> state = jax.jit(env.reset)(jax.random.key(0))

@@ -3,7 +3,7 @@
 Each function makes a policy for an environment of `envs.voltage.control`: `policy(state) -> action` [N, 1], pure, to be
 jitted and vmapped like the environment itself.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("voltage_33")
   >>> policy = droop(env)

@@ -7,7 +7,7 @@ power flow and data included.
 Written from the facts of the public environment and checked against rollouts recorded from it, oddities included: after
 a reset the first data row is used twice (with fresh noise), and observations mix the solved row with the next.
 
-Example:
+Examples:
   >>> import jax, envs
   >>> env = envs.make("voltage_33")
   >>> state = jax.jit(env.reset)(jax.random.key(0))

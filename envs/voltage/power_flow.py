@@ -5,7 +5,7 @@ inverse of the admittance matrix without the slack's row and column, S the compl
 contracts wherever a feeder is operated, so it is iterated (the "Z-bus" or implicit-Gauss method), sped up by Anderson
 acceleration of depth 2: one matrix product per iteration, the same for every network, radial or meshed.
 
-Example:
+Examples:
   >>> import jax.numpy as jnp
   >>> network = load_network("case33")
   >>> flow = solve(network, jnp.full(33, -0.1), jnp.full(33, -0.05))     # consumption is negative
@@ -124,7 +124,7 @@ def solve(
       tolerance: p.u.; the dtype's entry in TOLERANCE where None.
       max_iterations: of the accelerated fixed point, before a state counts as unsolvable.
 
-    Example:
+    Examples:
       >>> flows = jax.vmap(lambda p: solve(load_network("case33"), p, 0.5 * p))(-jnp.ones((4, 33)) * 0.1)
       >>> flows.vm_pu.shape
       (4, 33)

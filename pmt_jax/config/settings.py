@@ -311,7 +311,7 @@ def load_config(
     Raises:
       UsageError: no such file, an unknown field, or a value of the wrong type or range.
 
-    Example:
+    Examples:
       >>> load_config("lane", method="happo", num_envs=8).num_envs
       8
     """

@@ -39,7 +39,7 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
     Raises:
       UsageError: the settings cannot be used, or name a run to start from.
 
-    Example:
+    Examples:
       >>> from pmt_jax import load_config
       >>> train = make_train(load_config("lane", num_envs=8, steps=200, log_interval=1))
       >>> keys = jax.random.split(jax.random.key(0), 2)

@@ -1,6 +1,6 @@
 """An exported team policy in NumPy alone; this file needs nothing else and may be copied anywhere.
 
-Example:
+Examples:
   policy = load("policy.npz")
   action = policy(obs)  # obs [..., N, O] as the environment gives them -> mean action [..., N, A]
 """

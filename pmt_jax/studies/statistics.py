@@ -4,7 +4,7 @@ Averages are the mean and the interquartile mean, which one lucky seed cannot ca
 2108.13264). The percentile bootstrap's 95 % interval covers 81 to 91 % at five seeds, so intervals are Student's here.
 Scores come as one number per seed.
 
-Example:
+Examples:
   >>> iqm([1.0, 2.0, 3.0, 100.0])
   2.5
   >>> probability_of_improvement([[2.0, 3.0]], [[1.0, 2.0]])
