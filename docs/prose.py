@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import json
 import pathlib
 import re
 import sys
@@ -85,6 +86,8 @@ def texts(files: list[str]) -> Iterator[tuple[str, str]]:
         if name not in RULES["sentences"]["frozen"]:
             yield name, prose(path.read_text())
     if not files:
+        cells = json.loads((ROOT / "docs" / "tutorial.ipynb").read_text())["cells"]
+        yield "tutorial", prose("\n\n".join("".join(x["source"]) for x in cells if x["cell_type"] == "markdown"))
         yield "settings", ".\n\n".join(field.metadata["help"] for field in dataclasses.fields(Config)[1:])
         yield "metrics", ".\n\n".join(metric.definition for metric in METRICS.values())
         for command, parser in make_parser()[1].items():
