@@ -78,8 +78,12 @@ def make(name: str, **options: Any) -> Env:
 
 
 def columns(name: str) -> Mapping[str, Column]:
-    """The entries of a task's `info` that tables show, by their name in `info`; none for a task in a file."""
-    return _TASKS[name].columns if name in _TASKS else {}
+    """The entries of a task's `info` that tables show, by their name in `info`; none for a task in a file.
+
+    A free partition of a robot, like ant_6_2, has the columns of the robot's other tasks.
+    """
+    families = {known.split("_")[0]: task.columns for known, task in _TASKS.items()}
+    return _TASKS[name].columns if name in _TASKS else families.get(name.split("_")[0], {})
 
 
 def task_options(name: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
-"""Tasks as environments of other libraries: gymnasium, PettingZoo, brax.
+"""Tasks as environments of other libraries (gymnasium, PettingZoo, brax, JaxMARL), and brax environments as tasks.
 
-The library is imported when its adapter is first asked for (`pip install "pmt-jax[adapters]"` brings all three).
+The library is imported when its adapter is first asked for (`pip install "pmt-jax[adapters]"` brings the first three;
+`to_jaxmarl` and `from_brax` import none).
 
 Examples:
   >>> import envs
@@ -17,17 +18,20 @@ from __future__ import annotations
 
 import importlib
 import types
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from ..base import Env
 from ..errors import TaskError
 
 if TYPE_CHECKING:
     from .brax_env import BraxEnv
+    from .from_brax_env import FromBrax
     from .gymnasium_vector import GymnasiumVector
+    from .jaxmarl_env import JaxMarlEnv
     from .pettingzoo_parallel import PettingZooParallel
 
-__all__ = ["to_brax", "to_gymnasium", "to_pettingzoo"]
+__all__ = ["from_brax", "to_brax", "to_gymnasium", "to_jaxmarl", "to_pettingzoo"]
 
 
 def to_gymnasium(env: Env, num_envs: int, seed: int = 0) -> GymnasiumVector:
@@ -70,6 +74,59 @@ def to_brax(env: Env) -> BraxEnv:
       TaskError: brax is not installed.
     """
     return _adapter("brax", "brax_env").BraxEnv(env)
+
+
+def to_jaxmarl(env: Env) -> JaxMarlEnv:
+    """`env` with JaxMARL's interface: `reset(key)`, `step(key, state, actions)`, dictionaries by `agent_0` ...
+
+    Every agent gets the team's reward. `infos` holds arrays [N]: `cost` (an agent's own, summed over K; of several also
+    `cost/0` ...), `truncated`, and the task's own scalars. An episode ends for all agents, by the task's rule or its
+    time limit, and the next begins in the same step, as in JaxMARL. It is no subclass: JaxMARL's trainers and
+    `LogWrapper` need none.
+
+    Example:
+      >>> import envs, jax
+      >>> env = to_jaxmarl(envs.make("lane"))
+      >>> obs, state = env.reset(jax.random.key(0))
+      >>> actions = {agent: env.action_space(agent).sample(jax.random.key(1)) for agent in env.agents}
+      >>> obs, state, rewards, dones, infos = env.step(jax.random.key(2), state, actions)
+      >>> infos["cost"].shape, bool(dones["__all__"])
+      ((2,), False)
+    """
+    return importlib.import_module(".jaxmarl_env", __name__).JaxMarlEnv(env)
+
+
+def from_brax(
+    env: Any,
+    cost: str,
+    cost_limit: float,
+    *,
+    above: float | None = None,
+    horizon: int = 1000,
+    partition: str | Sequence[Sequence[int]] = "",
+    name: str = "",
+) -> FromBrax:
+    """A `brax.envs.Env` or MuJoCo Playground environment, one of whose metrics is a cost, as a task of ours.
+
+    Args:
+      env: without wrappers: time limits, auto-reset and batches are `envs.vector`'s.
+      cost: the metric; clipped to [0, 1], and the same for every agent.
+      cost_limit: allowed sum of costs over an episode.
+      above: where given, the cost is 1 while the metric is above it, else 0.
+      horizon: control steps of an episode.
+      partition: the actuators of each agent, as `0,1|2,3` or lists; one agent where empty. Every agent sees the whole
+        observation, and of several also its own one-hot index.
+      name: of the task; the class's where empty.
+
+    Raises:
+      TaskError: no such metric, or a partition that leaves an actuator out.
+
+    Example (a file `my_brax.py` for `pmt train my_brax.py:ant`):
+        def ant():
+            return from_brax(brax.envs.get_environment("ant"), "x_velocity", 25, above=2.0, partition="0,1,2,3|4,5,6,7")
+    """
+    module = importlib.import_module(".from_brax_env", __name__)
+    return module.FromBrax(env, cost, cost_limit, above, horizon, partition, name or type(env).__name__.lower())
 
 
 def _adapter(library: str, module: str) -> types.ModuleType:

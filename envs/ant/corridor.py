@@ -28,6 +28,7 @@ import numpy as np
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, agent_index, joints, length, motors
 from ..errors import one_of, typed
+from ..partition import evenly, parse
 from ..physics import PhysicsState, make_engine
 from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model, touching
 
@@ -74,6 +75,7 @@ class AntCorridor:
     Args:
       num_agents: 2 (four motors each: the two legs in front, the two behind) or 4 (one leg each: legs 4, 1, 2, 3). The
         order is the one that the reference code effectively uses, not the one its partition table declares.
+      partition: another division of the eight motors in place of `num_agents`, agents apart by `|`: `0,1,2,3,4,5|6,7`.
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
       observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
@@ -88,6 +90,7 @@ class AntCorridor:
         self,
         num_agents: int = 2,
         *,
+        partition: str = "",
         physics: str = "auto",
         solver: str = "converged",
         observation: str = "zscore",
@@ -112,25 +115,27 @@ class AntCorridor:
             threads=threads,
         )
         self.engine = self._engine.name
-        action_dim = self.model.nu // num_agents
+        count = self.model.nu
+        self._partition = parse(partition, count) if partition else evenly(num_agents, count)
+        num_agents, action_dim = self._partition.mask.shape
         seen = (*joints(self.model, unseen=2), *PLACE)
         names = motors(self.model)
         self.declares = Declarations(
             observation=(*seen, agent_index(num_agents)),
             state=seen,
-            actions=tuple(tuple(names[i * action_dim :][:action_dim]) for i in range(num_agents)),
+            actions=tuple(tuple(names[motor] for motor in group) for group in self._partition.groups),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
         )
         self.spec = EnvSpec(
-            name=f"ant_{num_agents}x{action_dim}",
+            name=f"ant_{self._partition.name}",
             num_agents=num_agents,
             obs_dim=length(self.declares.observation),
             action_dim=action_dim,
             state_dim=length(seen),
             num_costs=1,
             horizon=HORIZON,
-            action_mask=np.ones((num_agents, action_dim), np.float32),
+            action_mask=self._partition.mask,
             cost_limit=COST_LIMIT,
         )
 
@@ -148,7 +153,7 @@ class AntCorridor:
     def step(self, state: State, action: jax.Array) -> State:
         """One control step of 0.05 s with `action` [N, A]; the motors saturate at 1, the control cost does not."""
         carry: Carry = state.carry
-        ctrl = jnp.asarray(action, carry.torso_xpos.dtype).reshape(-1)  # agents in order fill the actuator vector
+        ctrl = self._partition.join(jnp.asarray(action, carry.torso_xpos.dtype))
         after, out = self._engine.step(carry.physics, ctrl)
         reward, reward_parts = self._get_reward(carry.torso_xpos, out["torso_xpos"], ctrl, out["contact_force"])
         terminated = self._get_termination(after, out["torso_xquat"])

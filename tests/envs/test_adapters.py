@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import adapters
+from envs import adapters, user
 from envs.base import State
 from envs.toys import HORIZON, Lane
 
@@ -117,6 +117,85 @@ def test_brax_wrappers_accept_a_task_and_say_what_it_says():
     np.testing.assert_array_equal(state.obs, first)  # brax has reset it
     np.testing.assert_allclose(state.info["eval_metrics"].episode_metrics["cost"], paid)
     assert step(state, jnp.zeros((3, 4))).done.sum() == 0
+
+
+def test_jaxmarl_gets_what_the_task_says_and_a_new_episode_in_the_same_step():
+    env = Fragile()
+    team = adapters.to_jaxmarl(env)
+    assert team.observation_space("agent_1").shape == (8,) and team.action_space("agent_0").shape == (2,)
+    obs, state = jax.jit(team.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(team.step)
+    plain = jax.tree.map(lambda x: x[0], state.env)
+    np.testing.assert_array_equal(jnp.stack(list(obs.values())), plain.obs)
+    for push in (0.2, 1.0):  # the second push ends the episode
+        plain = env.step(plain, jnp.full((2, 2), push))
+        actions = dict.fromkeys(team.agents, jnp.full(2, push))
+        obs, state, rewards, dones, infos = step(jax.random.PRNGKey(1), state, actions)
+        np.testing.assert_allclose(list(rewards.values()), plain.reward, rtol=1e-6)
+        np.testing.assert_array_equal(infos["cost"], plain.cost.sum(-1))
+        assert {bool(done) for done in dones.values()} == {bool(plain.terminated)}
+    assert dones["__all__"] and not infos["truncated"].any() and infos["position"].shape == (2,)
+    assert (obs["agent_0"][0] + 1) / 2 < 0.1  # where a new episode begins
+
+
+def test_jaxmarl_ends_with_the_time_limit_and_cuts_actions_that_an_agent_lacks():
+    team = adapters.to_jaxmarl(Uneven())
+    assert [team.action_space(agent).shape for agent in team.agents] == [(2,), (1,)]
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    _, state = jax.vmap(team.reset)(keys)
+    actions = dict.fromkeys(team.agents, jnp.full((3, 2), 0.5))  # a trainer that shares one network pads them
+    step = jax.jit(jax.vmap(team.step))
+    first = None
+    for _ in range(HORIZON):
+        _, state, _, dones, infos = step(keys, state, actions)
+        first = infos["position"] if first is None else first
+    np.testing.assert_allclose(first, 0.2 * (0.5 + 0.25), rtol=1e-6)
+    assert dones["__all__"].all() and infos["truncated"].all() and infos["cost"].shape == (3, 2)
+    assert not step(keys, state, actions)[3]["__all__"].any()
+
+
+def test_jaxmarl_wraps_it():
+    wrappers = pytest.importorskip("jaxmarl.wrappers.baselines")
+    team = wrappers.LogWrapper(adapters.to_jaxmarl(envs.make("lane")))
+    _, state = team.reset(jax.random.PRNGKey(0))
+    for _ in range(HORIZON):
+        _, state, _, _, infos = team.step(jax.random.PRNGKey(0), state, dict.fromkeys(team.agents, jnp.zeros(2)))
+    assert (infos["returned_episode_lengths"] == HORIZON).all() and (infos["cost"] == 0).all()
+
+
+def test_a_brax_environment_becomes_a_task():
+    """`lane` to brax and back is `lane`, to the cost's mean over agents."""
+    pytest.importorskip("brax")
+    lane = envs.make("lane")
+    back = adapters.from_brax(adapters.to_brax(lane), "cost", 1.0, horizon=HORIZON, partition=[[3, 0], [1, 2]])
+    user.check_shapes(back, "lane and back")
+    assert (back.spec.num_agents, back.spec.obs_dim, back.spec.state_dim, back.spec.name) == (2, 18, 16, "braxenv")
+    ours, theirs = back.reset(jax.random.key(0)), lane.reset(jax.random.key(0))
+    for _ in range(4):
+        theirs = lane.step(theirs, jnp.array([[0.1, 0.2], [0.3, 1.0]]))
+        ours = jax.jit(back.step)(ours, jnp.array([[1.5, 0.1], [0.2, 0.3]]))  # 1.5 is clipped, as lane does itself
+        np.testing.assert_allclose(ours.reward, theirs.reward, rtol=1e-6)
+        np.testing.assert_array_equal(ours.cost, jnp.full((2, 1), theirs.cost.mean()))
+        np.testing.assert_array_equal(ours.obs[:, :16], jnp.tile(theirs.obs.ravel(), (2, 1)))
+        np.testing.assert_array_equal(ours.obs[:, 16:], jnp.eye(2))
+    low = adapters.from_brax(adapters.to_brax(lane), "position", 1.0, above=0.2)
+    assert (low.spec.num_agents, low.spec.obs_dim, low.spec.action_dim) == (1, 16, 4)
+    state = low.step(low.reset(jax.random.key(0)), jnp.full((1, 4), 0.3))  # to 0.12, then 0.216
+    assert state.cost == 0 and low.step(state, jnp.full((1, 4), 0.3)).cost == 1
+
+
+@pytest.mark.parametrize(
+    ("metric", "partition", "said"),
+    [
+        ("costs", "", "unknown metric 'costs'; did you mean 'cost'"),
+        ("cost", "0,1|2", "each of the actuators 0 to 3 once"),
+        ("cost", "0,1|2,x", "each of the actuators 0 to 3 once"),
+    ],
+)
+def test_brax_environments_that_cannot_be_used(metric: str, partition: str, said: str):
+    pytest.importorskip("brax")
+    with pytest.raises(envs.TaskError, match=said):
+        adapters.from_brax(adapters.to_brax(envs.make("lane")), metric, 1.0, partition=partition)
 
 
 def test_a_missing_library_is_one_sentence_and_nothing_is_imported_before_it_is_asked_for():

@@ -185,6 +185,18 @@ def test_agents_drive_the_motors_in_order():
     np.testing.assert_allclose(a.info["reward_ctrl"], -0.5 * np.sum(np.asarray(action) ** 2), rtol=1e-6)
 
 
+def test_free_partitions_drive_the_motors_that_they_name():
+    two = envs.make("ant_2x4", physics="mujoco")
+    free = envs.make("ant_2x4", physics="mujoco", partition="0,7,2,3,4,5|6,1")
+    assert (free.spec.name, free.spec.action_dim, free.spec.action_mask.sum(1).tolist()) == ("ant_6_2", 6, [6, 2])
+    assert envs.make("ant_2x4", physics="mujoco", partition="0,1|2,3|4,5|6,7").spec.name == "ant_4x2"
+    assert envs.columns("ant_6_2") == envs.columns("ant_2x4") and not envs.columns("my_task")
+    start, action = two.reset(jax.random.key(0)), jnp.linspace(-1, 1, 8)
+    padded = jnp.stack([action[jnp.array([0, 7, 2, 3, 4, 5])], jnp.pad(action[jnp.array([6, 1])], (0, 4))])
+    a, b = two.step(start, action.reshape(2, 4)), free.step(free.restore(**two.raw(start)), padded)
+    np.testing.assert_array_equal(a.carry.physics.qpos, b.carry.physics.qpos)
+
+
 def test_restore_is_the_inverse_of_raw():
     env, _ = stepper("mujoco")
     step = jax.jit(env.step)
@@ -391,6 +403,7 @@ def test_fast_solver_stays_near_the_converged_one():
         ({"observation": "zscor"}, "did you mean 'zscore'"),
         ({"walls": "solids"}, "did you mean 'solid'"),
         ({"threads": 0}, "threads must be at least 1"),
+        ({"partition": "0,1,2,3|4,5,6"}, "each of the actuators 0 to 7 once"),
         ({"phisics": "mjx"}, "did you mean 'physics'"),
     ],
 )
