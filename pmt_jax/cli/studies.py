@@ -72,7 +72,7 @@ def _add_compare(commands: Any) -> None:
         commands,
         "compare",
         run_compare,
-        "hold one run against another: pmt compare runs/f4sg runs/mappo_l -o curves.png",
+        "compare two runs of one task: pmt compare runs/f4sg runs/mappo_l -o curves.png",
         description="Reward, cost and seeds within the limit: difference of means and probability of improvement, "
         "each with its 95 %% interval over seeds.",
     )
