@@ -10,10 +10,12 @@ import ast
 import doctest
 import functools
 import importlib
+import importlib.util
 import json
 import pathlib
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,7 +28,7 @@ from pmt_jax.cli import flags
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.parser import refuse_unknown
 from pmt_jax.config.methods import METHODS
-from pmt_jax.config.settings import load_config
+from pmt_jax.config.settings import FIELDS, load_config
 
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
@@ -44,12 +46,12 @@ def pages(what: str, slow: frozenset[str] | set[str] = frozenset()) -> list[Any]
     return [pytest.param(x, id=str(x.relative_to(ROOT)), marks=marks[x.stem in slow]) for x in found]
 
 
-def commands(path: pathlib.Path) -> list[list[str]]:
-    """The words after `pmt` of each command in a page's shell blocks."""
+def commands(path: pathlib.Path, program: str = "pmt") -> list[list[str]]:
+    """The words after `program` of each such command in a page's shell blocks."""
     blocks = re.findall(r"```bash\n(.*?)```", path.read_text().replace("\\\n", " "), re.DOTALL)
     lines = re.sub(r"\$\(.*?\)", "", "\n".join(blocks)).splitlines()
     words = [shlex.split(part, comments=True) for line in lines for part in re.split(r"&&|[|;]", line)]
-    return [each[each.index("pmt") + 1 :] for each in words if "pmt" in each]
+    return [each[each.index(program) + 1 :] for each in words if program in each]
 
 
 @pytest.fixture(autouse=True)
@@ -154,6 +156,21 @@ def test_commands_in_markdown(path: pathlib.Path):
         source = getattr(arguments, "source", "")
         if arguments.command == "train" and source.removeprefix("paper/") in tasks.names():
             load_config(source, preset=arguments.preset, **flags.given(arguments))
+
+
+@pytest.mark.parametrize("path", pages("python -m "))
+def test_modules_in_markdown(path: pathlib.Path):
+    """Those of this repository can be found."""
+    for words in commands(path, "python"):
+        if words[0] == "-m" and words[1].split(".")[0] in ("bench", "docs", "pmt_jax"):
+            assert importlib.util.find_spec(words[1]), words
+
+
+@pytest.mark.parametrize("path", pages("```toml"))
+def test_toml_in_markdown(path: pathlib.Path):
+    for block in re.findall(r"```toml\n(.*?)```", path.read_text(), re.DOTALL):
+        table = tomllib.loads(block)
+        assert table.keys() - {"sweep", "extends", "env", "method"} <= FIELDS.keys()
 
 
 @pytest.mark.full
