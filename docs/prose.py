@@ -60,8 +60,9 @@ def findings(name: str, text: str) -> Iterator[str]:
 
 def wording(name: str, text: str) -> Iterator[str]:
     """The words of a text that docs/prose.toml replaces, a line each."""
+    in_one_line = text.replace("\n", " ")
     for pattern, instead in RULES["instead"].items():
-        for found in re.finditer(rf"\b(?:{pattern})\b", text, re.IGNORECASE):
+        for found in re.finditer(rf"\b(?:{pattern})\b", in_one_line, re.IGNORECASE):
             yield f"{name}:{_line(text, found.start())}: '{found[0]}'; write: {instead}"
 
 
