@@ -74,6 +74,14 @@ def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypa
     assert code == 1 and "seed 0 at step 400" in text and "seed 1 at step 600" in text and "done" not in text
     assert rows(tmp_path / "run")[-1]["step"] == 600
     assert saved(tmp_path / "run")["0.update"].tolist() == [2, 4]
+    # With --debug they go on from there, to be looked at; here by a program without its checks.
+    monkeypatch.undo()
+    unchecked = trainer.compile_run
+    monkeypatch.setattr(
+        trainer, "compile_run", lambda setup, say: unchecked(dataclasses.replace(setup, debug=False), say)
+    )
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run", "--resume", "--debug")
+    assert code == 0 and saved(tmp_path / "run")["0.update"].tolist() == [12, 14]
 
 
 def row(**changes: float) -> dict[str, Any]:
