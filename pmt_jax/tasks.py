@@ -43,7 +43,7 @@ def _envs() -> types.ModuleType:
 
     if getattr(envs, "__pmt__", None) != "pmt-jax":
         raise UsageError(
-            f"another package named 'envs' stands in front of ours: {getattr(envs, '__file__', None) or envs}; "
+            f"another package named 'envs' hides ours: {getattr(envs, '__file__', None) or envs}; "
             "remove it (pip uninstall envs), or run from another folder, then reinstall pmt-jax"
         )
     return envs

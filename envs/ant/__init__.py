@@ -5,7 +5,7 @@ from ..columns import Column
 COLUMNS = {
     "outside": Column(
         "outside",
-        "share of steps beyond a wall; reference walls do not block, nor is it costly behind their bands",
+        "share of steps beyond a wall; reference walls do not block, and behind their bands nothing costs",
         0,
         1,
     )

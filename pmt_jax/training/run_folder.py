@@ -83,7 +83,7 @@ def _same_settings(old: Config, new: Config, out: pathlib.Path, change: bool) ->
     """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
     changed = {name: x for name, x in differences(old, new).items() if name in IDENTITY or not change}
     if changed.keys() - {"steps"}:
-        advice = "resume it unchanged (only --steps may grow), add --change to go on with the new ones"
+        advice = "resume it unchanged (only --steps may grow), add --change to continue with the new ones"
         if change:
             advice = f"--change cannot change {', '.join(changed)}; leave them as they are"
         difference = "".join(f"\n  {name}: {x}" for name, x in changed.items() if name != "steps")

@@ -165,7 +165,7 @@ def test_another_package_named_envs_is_noticed(tmp_path: pathlib.Path):
         text=True,
     )
     assert result.returncode == 2
-    assert "another package named 'envs' stands in front of ours" in result.stderr
+    assert "another package named 'envs' hides ours" in result.stderr
     assert result.stderr.count("\n") == 1
 
 
