@@ -284,6 +284,30 @@ def as_weights(file: pathlib.Path) -> str:
     return markdown([*head, "last chunk"], body)
 
 
+def as_why(file: pathlib.Path) -> str:
+    """What the policy learned from: how well the cost critic explains its targets, how fear tells danger from safety.
+
+    Means over seeds and over the chunks of the first and of the second half of training. Targets are felt costs, with
+    F4SG and Mixed fear.
+    """
+    body = []
+    for run in sorted(runs.load(file), key=lambda run: (-_share(run), list(NAMES).index(run["method"]))):
+        found = {name: np.array(x, float) for name, x in run["diagnostics"].items()}
+        explained = found["cost_critic/explained_variance"]
+        halves = [f"{np.nanmean(half):.2f}" for half in np.array_split(explained, 2)]
+        line = [f"{_share(run):g}", label(run, [x for x in runs.load(file) if _share(x) == _share(run)]), *halves]
+        fear = [
+            np.nanmean(found[f"fear/{name}"]) for name in ("on_costly", "on_safe", "ece") if f"fear/{name}" in found
+        ]
+        shown = (
+            [f"{fear[0]:.3f}", f"{fear[1]:.4f}", f"{fear[0] / fear[1]:.0f}", f"{fear[2]:.4f}"] if fear else ["-"] * 4
+        )
+        body.append([*line, *shown])
+    head = ["p", "method", "explained variance of the cost critic, first half", "second half"]
+    head += ["fear of a step that is felt as costly", "of others", "ratio", "calibration error (ECE)"]
+    return markdown(head, body)
+
+
 def _mean_sd(x: Scores) -> str:
     form = ".0f" if abs(x.mean()) >= 100 else ".1f"
     return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
@@ -300,5 +324,6 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "candidate": as_candidate,
     "equivalence": as_equivalence,
     "weights": as_weights,
+    "why": as_why,
     "headline": as_headline,
 }

@@ -90,3 +90,15 @@ def test_the_second_round_names_each_criterion_that_does_not_hold(tmp_path: path
     assert len(rows) == 8
     lines = [line.split("|") for line in study.as_second(file).splitlines()[2:]]
     assert [line[-2].strip() != "-" for line in lines] == [line[3].strip() == "MAPPO-L" for line in lines]
+
+
+def test_why_gives_both_halves_of_the_critic_and_the_ratio_of_fear(tmp_path: pathlib.Path):
+    seen = {"cost_critic/explained_variance": [0.2] * 5 + [0.6] * 5}
+    fear = {"fear/on_costly": [0.3] * 10, "fear/on_safe": [0.1] * 10, "fear/ece": [0.01] * 10}
+    cells = [stored("f4sg", 0.5, [1.0, 2.0]) | {"diagnostics": seen | fear}]
+    cells += [stored("mappo_l", 0.5, [1.0, 2.0]) | {"diagnostics": seen}]
+    file = tmp_path / "x.json"
+    file.write_text(json.dumps(cells))
+    rows = [[x.strip() for x in line.split("|")[2:-1]] for line in study.as_why(file).splitlines()[2:]]
+    assert rows[0] == ["MAPPO-L", "0.20", "0.60", "-", "-", "-", "-"]
+    assert rows[1] == ["F4SG", "0.20", "0.60", "0.300", "0.1000", "3", "0.0100"]
