@@ -22,8 +22,9 @@ from typing import Any
 from pmt_jax.cli.parser import Parser, command, refuse_unknown, whole
 from pmt_jax.cli.process import answer
 
-from . import compare, records, render, runner, runs
+from . import compare, records, render, runner
 from .cases import BENCHES
+from .forms import runs
 
 say = functools.partial(print, flush=True)
 

@@ -1,11 +1,11 @@
 """Tables in the documentation, made from bench/results.
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
-bench/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` stands for the
+bench/forms/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` means the
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
 `paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks,
 `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each pair of methods. The study's forms are in
-bench/study.py; those of tasks, settings and methods, as `observation:ant_2x4`, in bench/pages.py.
+bench/forms/study.py; those of tasks, settings and methods, as `observation:ant_2x4`, in bench/forms/pages.py.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
-from . import pages, records, runs, study
-from .tables import TABLES, Reports
+from . import records
+from .forms import pages, runs, study
+from .forms.tables import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)

@@ -16,7 +16,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from bench import records, runs
+from bench import records
+from bench.forms import runs
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group
 

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench import records, runs, study
+from bench import records
+from bench.forms import runs, study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 from pmt_jax.studies.statistics import mean_interval
 

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from bench import records, runs
+from bench import records
+from bench.forms import runs
 from pmt_jax.studies.plot import INK, METHOD_COLOURS, cost_ticks
 
 from . import style

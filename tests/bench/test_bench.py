@@ -17,9 +17,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, pages, records, render, runner, runs, tables
+from bench import compare, measure, once, records, render, runner
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
+from bench.forms import pages, runs, tables
 from docs.figures import ant_paths, curves, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError

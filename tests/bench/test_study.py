@@ -8,8 +8,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from bench import study
-from bench.study import measures, welch
+from bench.forms import study
+from bench.forms.study import measures, welch
 
 
 def stored(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bench import tables
+from bench.forms import tables
 from places import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner

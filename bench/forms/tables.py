@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from pmt_jax.formats import markdown
 
-from .compare import on_cpu
-from .records import Report, Row, Rows
+from ..compare import on_cpu
+from ..records import Report, Row, Rows
 
 Reports = dict[str, Report]
 Figure = Callable[[Row, Rows], float | None]

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pmt_jax.config.settings import Config
 from pmt_jax.studies.statistics import holm, iqm, iqm_interval, probability_of_improvement, u_test
 
-from . import records, runs
+from .. import records
+from . import runs
 from .tables import markdown
 
 Scores = NDArray[np.float64]  # [seeds]

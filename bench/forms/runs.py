@@ -18,7 +18,7 @@ from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import mean_interval, u_test
 
-from . import records
+from .. import records
 
 Run = dict[str, Any]
 
