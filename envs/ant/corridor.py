@@ -27,7 +27,7 @@ import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, agent_index, joints, length, motors
-from ..errors import one_of, typed
+from ..errors import TaskError, one_of, typed
 from ..partition import evenly, parse
 from ..physics import PhysicsState, make_engine
 from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model, touching
@@ -51,6 +51,11 @@ PLACE = (
     Block("place off centre", 1, "m", "along y from the corridor's centre line"),
 )
 
+SWAY = ("none", "seen", "hidden")
+SWAY_REACH = 1.0  # m along y, how far the corridor moves to either side
+SWAY_RATE = 2.0 * np.pi / 10.0  # rad/s: a period in 10 s
+LINE = Block("velocity of the centre line", 1, "m/s", "along y")
+
 COSTLY_ANT = (0.86, 0.16, 0.12, 1.0)  # what a picture shows at the moment of cost: the ant in red,
 COSTLY_BAND = 0.36  # and the danger bands less transparent
 
@@ -63,10 +68,12 @@ class Carry:
     Attributes:
       physics: the engine's state.
       torso_xpos: [3] m, where the integrator's last stage saw the torso; the next forward reward starts from it.
+      phase: [] rad, of a corridor that sways; None of one that does not.
     """
 
     physics: PhysicsState
     torso_xpos: jax.Array
+    phase: jax.Array | None = None
 
 
 class AntCorridor:
@@ -82,6 +89,9 @@ class AntCorridor:
         learners that keep running moments).
       walls: `reference` (massless, so they do not block, and 1.8 m behind them nothing costs), `costly` (they do not
         block, but everything outside costs) or `solid` (they block torso and feet; no gaps).
+      sway: `none`, or the corridor moves along y by 1 m x sin(phase), a period in 10 s from a random phase: danger that
+        is not where it was. `seen`: observations measure the place from where the centre line is now, and hold its
+        velocity. `hidden`: they measure it from where the line is on average.
       threads: of the `mujoco` engine; all usable CPUs where None.
     """
 
@@ -95,11 +105,17 @@ class AntCorridor:
         solver: str = "converged",
         observation: str = "zscore",
         walls: str = "reference",
+        sway: str = "none",
         threads: int | None = None,
     ):
         one_of("num_agents", str(num_agents), ("2", "4"))
         self._standardise = one_of("observation", observation, ("zscore", "raw")) == "zscore"
         self.walls = one_of("walls", walls, WALLS)
+        self.sway = one_of("sway", sway, SWAY)
+        if sway != "none" and walls == "solid":
+            raise TaskError(
+                f"sway = {sway} moves the walls, and solid ones stand still; take walls = reference or costly"
+            )
         torso = model().body("torso").id
         self._engine = make_engine(
             self.model,
@@ -118,7 +134,7 @@ class AntCorridor:
         count = self.model.nu
         self._partition = parse(partition, count) if partition else evenly(num_agents, count)
         num_agents, action_dim = self._partition.mask.shape
-        seen = (*joints(self.model, unseen=2), *PLACE)
+        seen = (*joints(self.model, unseen=2), *PLACE, *((LINE,) if sway == "seen" else ()))
         names = motors(self.model)
         self.declares = Declarations(
             observation=(*seen, agent_index(num_agents)),
@@ -148,7 +164,11 @@ class AntCorridor:
         )
         qvel = RESET_VELOCITY_NOISE * jax.random.normal(velocity_key, start.qvel.shape, start.qvel.dtype)
         quaternion = qpos[3:7] / jnp.linalg.norm(qpos[3:7])
-        return self._initial_state(PhysicsState(qpos.at[3:7].set(quaternion), qvel, start.warmstart), qpos[:3])
+        phase = None
+        if self.sway != "none":
+            phase = jax.random.uniform(jax.random.fold_in(key, 2), (), qpos.dtype, 0.0, 2.0 * jnp.pi)
+        physics = PhysicsState(qpos.at[3:7].set(quaternion), qvel, start.warmstart)
+        return self._initial_state(Carry(physics, qpos[:3], phase))
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step of 0.05 s with `action` [N, A]; the motors saturate at 1, the control cost does not."""
@@ -157,12 +177,14 @@ class AntCorridor:
         after, out = self._engine.step(carry.physics, ctrl)
         reward, reward_parts = self._get_reward(carry.torso_xpos, out["torso_xpos"], ctrl, out["contact_force"])
         terminated = self._get_termination(after, out["torso_xquat"])
-        cost, cost_parts = self._get_cost(out["torso_xpos"], terminated)
-        obs, global_state = self._get_obs(after)
-        info = reward_parts | cost_parts | _location(out["torso_xpos"]) | {"physics_overflow": out["overflow"]}
-        return State(obs, global_state, reward, cost, terminated, info, Carry(after, out["torso_xpos"]))
+        phase = None if carry.phase is None else (carry.phase + SWAY_RATE * CONTROL_DT) % (2.0 * jnp.pi)
+        place = _relative(out["torso_xpos"], phase)
+        cost, cost_parts = self._get_cost(place, terminated)
+        obs, global_state = self._get_obs(after, phase)
+        info = reward_parts | cost_parts | _location(place) | {"physics_overflow": out["overflow"]}
+        return State(obs, global_state, reward, cost, terminated, info, Carry(after, out["torso_xpos"], phase))
 
-    def restore(self, qpos: Any, qvel: Any, warmstart: Any = None, torso_xpos: Any = None) -> State:
+    def restore(self, qpos: Any, qvel: Any, warmstart: Any = None, torso_xpos: Any = None, phase: Any = None) -> State:
         """A State from MuJoCo's quantities.
 
         Args:
@@ -170,6 +192,7 @@ class AntCorridor:
           qvel: [14] velocities.
           warmstart: [14] `qacc_warmstart`; zero where None.
           torso_xpos: [3] where the last control step left the torso's `xpos`; qpos[:3] where None.
+          phase: [] rad, of a corridor that sways; 0 where None.
         """
         start = self._engine.start()
         dtype = start.qpos.dtype
@@ -179,7 +202,10 @@ class AntCorridor:
         # A unit quaternion is left alone to the last bit, so that `raw` and `restore` are inverses.
         norm = jnp.linalg.norm(qpos[3:7])
         quaternion = jnp.where(jnp.abs(norm - 1.0) > 1e-5, qpos[3:7] / norm, qpos[3:7])
-        return self._initial_state(PhysicsState(qpos.at[3:7].set(quaternion), qvel, warmstart), torso_xpos)
+        phase = None if self.sway == "none" else jnp.asarray(0.0 if phase is None else phase, dtype)
+        return self._initial_state(
+            Carry(PhysicsState(qpos.at[3:7].set(quaternion), qvel, warmstart), torso_xpos, phase)
+        )
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -189,6 +215,7 @@ class AntCorridor:
             "qvel": carry.physics.qvel,
             "warmstart": carry.physics.warmstart,
             "torso_xpos": carry.torso_xpos,
+            **({} if carry.phase is None else {"phase": carry.phase}),
         }
 
     @property
@@ -197,31 +224,43 @@ class AntCorridor:
         return model(self.walls)
 
     def decorate(self, scene: mujoco.MjvScene, raw: dict[str, np.ndarray], cost: float) -> None:
-        """Shows the moment of cost in a scene of `model`: a red ant, and bands that glow; see `envs.base`."""
-        del raw
-        if cost <= 0:
-            return
+        """Shows the moment of cost in a scene of `model`: a red ant, and bands that glow; see `envs.base`.
+
+        Walls and bands of a corridor that sways are drawn where they are.
+        """
+        aside = SWAY_REACH * np.sin(raw["phase"]) if self.sway != "none" else 0.0
         for geom in scene.geoms[: scene.ngeom]:
-            if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
+            moving = geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC
+            name = "" if moving else self.model.geom(geom.objid).name
+            if name.startswith(("danger", "wall")):
+                geom.pos[1] += aside
+            if cost > 0 and moving:
                 geom.rgba[:] = COSTLY_ANT
-            elif self.model.geom(geom.objid).name.startswith("danger"):
+            if cost > 0 and name.startswith("danger"):
                 geom.rgba[3] = COSTLY_BAND
 
-    def _initial_state(self, physics: PhysicsState, torso_xpos: jax.Array) -> State:
+    def _initial_state(self, carry: Carry) -> State:
         """A State that no transition led to."""
-        obs, global_state = self._get_obs(physics)
-        zero = jnp.zeros((), torso_xpos.dtype)
+        obs, global_state = self._get_obs(carry.physics, carry.phase)
+        zero = jnp.zeros((), carry.torso_xpos.dtype)
         names = ("forward", "ctrl", "contact", "survive")
         info = {f"reward_{name}": zero for name in names} | {"cost_obj": zero, "cost_done": zero}
-        info |= _location(torso_xpos) | {"physics_overflow": zero}
+        info |= _location(_relative(carry.torso_xpos, carry.phase)) | {"physics_overflow": zero}
         cost = jnp.zeros((self.spec.num_agents, 1), zero.dtype)
-        return State(obs, global_state, zero, cost, jnp.zeros((), bool), info, Carry(physics, torso_xpos))
+        return State(obs, global_state, zero, cost, jnp.zeros((), bool), info, carry)
 
-    def _get_obs(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
-        """Observations [N, 29 + N] and the raw state [29] they all contain; agents differ in the one-hot index only."""
+    def _get_obs(self, physics: PhysicsState, phase: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Observations [N, 29 + N] and the raw state [29] they all contain; agents differ in the one-hot index only.
+
+        Where a sway is seen, both have an entry more.
+        """
         qpos, qvel = physics.qpos, physics.qvel
-        place = jnp.stack([qpos[0] / 5.0, off_centre(qpos[0], qpos[1])])
-        raw = jnp.concatenate([qpos[2:], qvel, place])
+        shown = phase if self.sway == "seen" else None
+        at = _relative(qpos, shown)
+        place = [at[0] / 5.0, off_centre(at[0], at[1])]
+        if shown is not None:
+            place.append(SWAY_REACH * SWAY_RATE * jnp.cos(shown))
+        raw = jnp.concatenate([qpos[2:], qvel, jnp.stack(place)])
         num_agents = self.spec.num_agents
         obs = jnp.concatenate(
             [jnp.broadcast_to(raw, (num_agents, *raw.shape)), jnp.eye(num_agents, dtype=raw.dtype)], axis=1
@@ -268,6 +307,11 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
     centre = jnp.where((x > first) & (x < second), (2 * first - x) * SLOPE, centre)
     centre = jnp.where((x > second) & (x < third), (x - third + first) * SLOPE, centre)
     return y - centre
+
+
+def _relative(place: jax.Array, phase: jax.Array | None) -> jax.Array:
+    """A place [>= 2] m beside a corridor that sways, as the same place beside one that does not."""
+    return place if phase is None else place.at[1].add(-SWAY_REACH * jnp.sin(phase))
 
 
 def _location(torso: jax.Array) -> dict[str, jax.Array]:

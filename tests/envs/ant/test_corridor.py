@@ -381,6 +381,42 @@ def test_solid_walls_leave_no_gap():
             assert (inside == blocked).all()
 
 
+def test_a_corridor_that_sways_costs_where_it_is_and_is_seen_there():
+    """A quarter of a period after phase 0 the centre line is a metre aside; what is hidden is only the observation."""
+    far = centre(5.0) + 2.7  # from a line that stands still: half a metre inside of the danger band
+    qpos = np.array([5.0, far, 0.75, 1, 0, 0, 0, *np.zeros(8)])
+    for quarter, costs in ((0.0, 0.0), (1.0, 0.0), (3.0, 1.0)):
+        phase = quarter * np.pi / 2
+        for sway in ("seen", "hidden"):
+            env = swaying(sway)
+            state = env.restore(qpos, np.zeros(14), phase=phase)
+            line = np.sin(phase) if sway == "seen" else 0.0
+            np.testing.assert_allclose(state.global_state[28], far - centre(5.0) - line, atol=1e-5)
+            if sway == "seen":
+                np.testing.assert_allclose(state.global_state[29], 0.2 * np.pi * np.cos(phase), atol=1e-6)
+            after = jax.jit(env.step)(state, jnp.zeros((2, 4)))
+            np.testing.assert_allclose(env.raw(after)["phase"], phase + 0.01 * np.pi, atol=1e-6)
+            assert float(after.cost[0, 0]) == costs
+
+
+def test_a_sway_moves_nothing_but_the_line():
+    """The same ant and the same physics; two resets have two phases."""
+    still, moving = envs.make("ant_2x4", physics="mujoco"), swaying("hidden")
+    key, action = jax.random.key(3), jnp.full((2, 4), 0.3)
+    start = [jax.jit(env.reset)(key) for env in (still, moving)]
+    np.testing.assert_array_equal(start[0].obs, start[1].obs)
+    after = [jax.jit(env.step)(state, action) for env, state in zip((still, moving), start, strict=True)]
+    np.testing.assert_array_equal(after[0].obs, after[1].obs)
+    np.testing.assert_array_equal(after[0].reward, after[1].reward)
+    assert moving.raw(start[1])["phase"] != moving.raw(jax.jit(moving.reset)(jax.random.key(4)))["phase"]
+    assert swaying("seen").spec.obs_dim == still.spec.obs_dim + 1
+
+
+@functools.cache
+def swaying(kind: str):
+    return envs.make("ant_2x4", physics="mujoco", sway=kind, observation="raw" if kind == "seen" else "zscore")
+
+
 def test_broken_physics_terminates_and_shows():
     env, _ = stepper("mujoco")
     state = env.step(env.reset(jax.random.key(0)), jnp.full((2, 4), jnp.nan))
@@ -402,6 +438,7 @@ def test_fast_solver_stays_near_the_converged_one():
         ({"solver": "quick"}, "unknown solver"),
         ({"observation": "zscor"}, "did you mean 'zscore'"),
         ({"walls": "solids"}, "did you mean 'solid'"),
+        ({"sway": "seen", "walls": "solid"}, "solid walls do not move"),
         ({"threads": 0}, "threads must be at least 1"),
         ({"partition": "0,1,2,3|4,5,6"}, "each of the actuators 0 to 7 once"),
         ({"phisics": "mjx"}, "did you mean 'physics'"),
