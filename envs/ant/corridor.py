@@ -114,7 +114,7 @@ class AntCorridor:
         self.sway = one_of("sway", sway, SWAY)
         if sway != "none" and walls == "solid":
             raise TaskError(
-                f"sway = {sway} moves the walls, and solid ones stand still; take walls = reference or costly"
+                f"sway = {sway} moves the walls, and solid walls do not move; take walls = reference or costly"
             )
         torso = model().body("torso").id
         self._engine = make_engine(
