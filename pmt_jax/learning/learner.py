@@ -129,19 +129,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     computed = {"batch": batch, "fear": fear, "cost_signal": cost_signal, "regret": regret, "log_weight": log_weight}
     computed |= {"advantage": advantage, "returns": returns, "cost_advantage": cost_advantage}
-    computed |= {"cost_returns": cost_returns, "critic": critic, "cost_critic": cost_critic}
-    check_finite(setup, state.update, **computed, actor=actor, multiplier=multiplier, episode_cost=episode_cost)
-    state = dataclasses.replace(
-        state,
-        actor=actor,
-        critic=critic,
-        cost_critic=cost_critic,
-        fear=fear,
-        regret=regret,
-        multiplier=multiplier,
-        episode_cost=episode_cost,
-        update=state.update + 1,
-    )
+    learned = {"critic": critic, "cost_critic": cost_critic, "fear": fear, "regret": regret, "actor": actor}
+    learned |= {"multiplier": multiplier, "episode_cost": episode_cost}
+    check_finite(setup, state.update, **{**computed, "cost_returns": cost_returns, **learned})
+    state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch),
         "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper)),

@@ -80,11 +80,7 @@ def train(
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
-        setup = dataclasses.replace(make_setup(config), trials=trials, mesh=sharding.make_mesh(config, count))
-        if debug and setup.mesh:
-            raise UsageError("--debug runs on one device in one process; leave out --devices")
-        setup = dataclasses.replace(setup, debug=debug)
-        memory.check(setup)
+        setup = _make_setup(config, trials, count, debug)
         begin = None if resume else warm_start(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say, change))
         _describe(setup, out, say)
@@ -92,19 +88,38 @@ def train(
             use_cache()
         state, programs = compile_run(setup, say)
         trainer = Trainer(setup, programs, begin(state) if begin else state, out, say)
-        try:
-            trainer.open(stack, resume, loggers, profile)
-            trainer.train(interrupts)
+        return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
+
+
+def _make_setup(config: Config, trials: Trials | None, count: int | None, debug: bool) -> Setup:
+    """The run's setup.
+
+    Raises:
+      UsageError: `debug` on several devices, or more memory than there is.
+    """
+    mesh = sharding.make_mesh(config, count)
+    if debug and mesh:
+        raise UsageError("--debug runs on one device in one process; leave out --devices")
+    setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
+    memory.check(setup)
+    return setup
+
+
+def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, begin: Callable[[], None]) -> int:
+    """Trains to the end, or until something stops it; returns the exit code."""
+    try:
+        begin()
+        trainer.train(interrupts)
+        stack.close()
+    except NotFinite as found:
+        trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
+        return 1
+    except OSError as error:
+        with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
             stack.close()
-        except NotFinite as found:
-            say(f"stopped: {found}; saved as of step {trainer.step:,}")
-            return 1
-        except OSError as error:
-            with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
-                stack.close()
-            say(trainer.write_failure(error))
-            return 1
-        return trainer.finish()
+        trainer.say(trainer.write_failure(error))
+        return 1
+    return trainer.finish()
 
 
 def _claim_folder(
