@@ -231,6 +231,7 @@ def test_every_result_is_used_by_a_page_or_a_test():
     elsewhere = {
         "ant_paths",
         "ant_paths_methods",
+        "fear_map",
         "hand_over_catch",
         *curves.FIGURES.values(),
     }  # of pictures, and of a test

@@ -127,7 +127,8 @@ def test_learning_rates_of_all_networks_halve_in_their_half_life():
         chex.assert_trees_all_equal(second.actor, made.step(plain, first)[0].actor)
 
 
-@pytest.mark.parametrize("method", ["mappo", pytest.param("r4sg", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["mappo", "r4sg"])
 def test_an_update_moves_no_policy_further_than_kl_max(method: str):
     """A shared actor moves for all agents at once, so its bound holds for their mean."""
     made = program(method)

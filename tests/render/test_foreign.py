@@ -45,6 +45,7 @@ def test_an_own_task_is_a_page_of_its_metrics_and_actions(pole: pathlib.Path, tm
     assert np.diff(lines["cost so far"][0]) == pytest.approx(data["cost"][1:])
 
 
+@pytest.mark.full
 def test_an_own_task_has_a_report(pole: pathlib.Path, tmp_path: pathlib.Path, cli):
     page = tmp_path / "report.html"
     code, _, err = cli("report", pole.parent, "--episodes", 1, "-o", page)

@@ -210,6 +210,7 @@ def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
     assert code == 2 and "Read-only file system; choose another folder" in err
 
 
+@pytest.mark.full
 def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Path, copy: pathlib.Path, cli):
     command = ("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 400)
     code, text, _ = cli(*command, "--change", "--clip", 0.1)

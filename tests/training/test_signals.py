@@ -71,6 +71,7 @@ def test_ctrl_c_twice_in_a_long_chunk_ends_the_run_at_once(tmp_path: pathlib.Pat
     assert not (tmp_path / ".claim").exists()
 
 
+@pytest.mark.full
 def test_a_closed_pipe_silences_the_output_and_training_continues(whole: pathlib.Path, tmp_path: pathlib.Path):
     words = ["train", *map(str, ARGUMENTS), "--steps", str(STEPS), "--out", str(tmp_path / "run")]
     command = f"{sys.executable} -m pmt_jax {shlex.join(words)} | head -2; exit ${{PIPESTATUS[0]}}"

@@ -234,6 +234,7 @@ def test_reset_draws_what_the_task_says():
     np.testing.assert_allclose(qvel.std(axis=0), 0.1, rtol=0.06)
 
 
+@pytest.mark.full
 def test_standing_still_earns_993_and_costs_nothing():
     env, _ = stepper("mujoco")
 

@@ -158,6 +158,7 @@ def test_observation_layout():
     np.testing.assert_allclose(obs[0, 200:], [0, -0.64, 0.54, 1, 0, 0, 0, *(-0.5, -0.5, -0.5, 0.5)], atol=1e-5)
 
 
+@pytest.mark.full
 def test_4x3_is_2x6_cut_in_halves():
     two, four = made(), made("4x3")
     action = np.random.default_rng(0).uniform(-1, 1, 40).astype(np.float32)

@@ -175,6 +175,7 @@ def test_team_passes_errors_on_and_stops(guilty):
     assert len(taken) == done and next(queue, None) is None
 
 
+@pytest.mark.full
 def test_double_precision_goes_through():
     done = run("""
         import jax, numpy as np

@@ -40,7 +40,7 @@ def worst(ours: np.ndarray, theirs: np.ndarray) -> float:
         ("full_nonoise", {}, "float64", 1e-7),
         pytest.param("full_nonoise", {}, "float32", 1e-5, marks=pytest.mark.full),
         ("bowl", {"barrier": "bowl"}, "float64", 1e-7),
-        ("history3", {"history": 3}, "float32", 1e-5),
+        pytest.param("history3", {"history": 3}, "float32", 1e-5, marks=pytest.mark.full),
     ],
 )
 def test_recorded_rollouts_are_replayed(tag: str, options: dict, dtype: str, tolerance: float) -> None:
