@@ -52,8 +52,9 @@ def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monk
 def test_training_stops_where_the_physics_lost_contacts(tmp_path: pathlib.Path, cli):
     """As MJX-Warp says it did where its buffers were too small; here from the fourth control step on."""
     (tmp_path / "lossy.py").write_text(
-        "import dataclasses\nfrom envs.base import Declarations\nfrom envs.toys import Lane\n\nclass Lossy(Lane):\n"
-        "    declares = Declarations(overflow='physics_overflow')\n"
+        "import dataclasses\nfrom envs.toys import Lane\n\nclass Lossy(Lane):\n    def __init__(self):\n"
+        "        super().__init__()\n"
+        "        self.declares = dataclasses.replace(self.declares, overflow='physics_overflow')\n"
         "    def restore(self, **raw):\n        return self._said(super().restore(**raw))\n"
         "    def step(self, state, action):\n        return self._said(super().step(state, action))\n"
         "    def _said(self, state):\n        lost = (state.carry.time >= 4).astype('float32')\n"
