@@ -46,6 +46,7 @@ def prose(markdown: str) -> str:
 
 def findings(name: str, text: str) -> Iterator[str]:
     """What to change in a text, a line each."""
+    # Ours stand first, too: proselint takes the first entry that fits a check.
     enabled = RULES["proselint"] | config.DEFAULT["checks"] | RULES["proselint"]
     for found in LintFile(name, text).lint({"max_errors": 1000, "checks": enabled}):
         yield f"{name}:{found.pos[0]}: {found.check_result.message}"

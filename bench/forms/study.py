@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from pmt_jax.config.settings import Config
-from pmt_jax.studies.statistics import holm, iqm, iqm_interval, probability_of_improvement, u_test
+from pmt_jax.studies.statistics import difference_interval, holm, iqm, iqm_interval, probability_of_improvement, u_test
 
 from .. import records
 from . import runs
@@ -155,9 +154,8 @@ def _difference(own: dict[str, Scores], base: dict[str, Scores]) -> str:
 
 def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
     """Difference of means of x [n] and y [m], and the half-width of Welch's interval."""
-    a, b = x.var(ddof=1) / x.size, y.var(ddof=1) / y.size
-    freedom = (a + b) ** 2 / (a**2 / (x.size - 1) + b**2 / (y.size - 1))
-    return float(x.mean() - y.mean()), float(scipy.special.stdtrit(freedom, (1 + level) / 2) * (a + b) ** 0.5)
+    low, high = difference_interval(x, y, level)
+    return (low + high) / 2, (high - low) / 2
 
 
 def as_second(file: pathlib.Path) -> str:
@@ -188,21 +186,15 @@ def as_candidate(file: pathlib.Path) -> str:
 
     def cell(task: str, share: float, **settings: Any) -> dict[str, Scores]:
         settings = {"method": "f4sg", "cost_seen": share, **settings}
-        same = [
-            x
-            for x in found
-            if x["task"] == task and {**_settings(x), **runs.curves(x).settings}.items() >= settings.items()
-        ]
-        return measures(same[0], last[task])
+        same = (x for x in found if x["task"] == task and _settings(x).items() >= settings.items())
+        return measures(next(same), last[task])
 
     body = []
     for task in ("voltage_33", "hand_over_2x6"):
         candidate, base = cell(task, 1.0, emotion_lr=0.01), cell(task, 1.0, method="mappo_l")
         middle, half = welch(candidate["training"], base["training"])
-        text = f"{middle:+.1f} [{middle - half:.1f}, {middle + half:.1f}]"
-        body.append(
-            ["1", f"true cost while training, less MAPPO-L's, `{task}`, p = 1", text, middle < 1 and middle + half < 5]
-        )
+        what = f"true cost while training, less MAPPO-L's, `{task}`, p = 1"
+        body.append(["1", what, _difference(candidate, base), middle < 1 and middle + half < 5])
     for task, share in (("ant_2x4", 0.03), ("voltage_33", 0.05)):
         candidate, usual = cell(task, share, emotion_lr=0.01), cell(task, share, emotion_lr=0.001)
         base = cell(task, share, method="mappo_l", lambda_kp=0.0)
@@ -292,11 +284,12 @@ def as_why(file: pathlib.Path) -> str:
     F4SG and Mixed fear.
     """
     body = []
-    for run in sorted(runs.load(file), key=lambda run: (-_share(run), list(NAMES).index(run["method"]))):
+    every = sorted(runs.load(file), key=lambda run: (-_share(run), list(NAMES).index(run["method"])))
+    for run in every:
         found = {name: np.array(x, float) for name, x in run["diagnostics"].items()}
         explained = found["cost_critic/explained_variance"]
         halves = [f"{np.nanmean(half):.2f}" for half in np.array_split(explained, 2)]
-        line = [f"{_share(run):g}", label(run, [x for x in runs.load(file) if _share(x) == _share(run)]), *halves]
+        line = [f"{_share(run):g}", label(run, [x for x in every if _share(x) == _share(run)]), *halves]
         fear = [
             np.nanmean(found[f"fear/{name}"]) for name in ("on_costly", "on_safe", "ece") if f"fear/{name}" in found
         ]

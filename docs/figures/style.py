@@ -7,17 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.forms import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
-NAMES = {
-    "mappo": "MAPPO",
-    "happo": "HAPPO",
-    "mappo_l": "MAPPO-L",
-    "macpo": "MACPO",
-    "f4sg": "F4SG",
-    "r4sg": "R4SG",
-    "mixed": "Mixed",
-}
+NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}
 DANGER = "#f6d5c3"  # a pale vermilion, where a step costs
 WALL = "#404040"
 GAP = 0.075  # of an axis' height, between two labels
