@@ -5,7 +5,7 @@ bench/forms/tables.py makes of the results; whatever stood there before is repla
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
 `paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks,
 `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each pair of methods. The study's forms are in
-bench/forms/study.py; those of tasks, settings and methods, as `observation:ant_2x4`, in bench/forms/pages.py.
+bench/forms/study.py and rounds.py; those of tasks, settings and methods, as `observation:ant_2x4`, in pages.py.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
 from . import records
-from .forms import pages, runs, study
+from .forms import pages, rounds, runs, study
 from .forms.tables import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
-STORED = {**runs.FORMS, **study.FORMS}
+STORED = {**runs.FORMS, **study.FORMS, **rounds.FORMS}
 
 
 def documents() -> list[pathlib.Path]:

@@ -1,0 +1,274 @@
+"""The tables of the study's second and third rounds: cells beside the one they are compared with, candidates beside
+their criteria.
+
+Cells are read at a common update, as the preregistration says: in the second round the last that all cells of the task
+reached, in the third the last that the cells of a comparison reached.
+"""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pmt_jax.config.settings import Config
+from pmt_jax.studies.statistics import holm, probability_of_improvement, u_test
+
+from . import runs
+from .study import NAMES, Scores, baseline, difference, label, mean_sd, measures, p_value, settings, share, welch
+from .tables import markdown
+
+MEASURES = ("end", "training", "reward")
+AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001}
+A, C = {"emotion_lr": 0.003}, {"emotion_lr": 0.01}  # the candidates of question b, both with `fear_start` nan
+
+
+def as_second(file: pathlib.Path) -> str:
+    """The second round: a row a cell; p corrected over the comparisons of one task with F4SG as it is."""
+    found = sorted(runs.load(file), key=lambda run: (run["task"], -share(run), -list(NAMES).index(run["method"])))
+    body = []
+    for task in dict.fromkeys(run["task"] for run in found):
+        cells = [run for run in found if run["task"] == task]
+        scores = _read(cells)
+        pairs = [(i, _fear_as_it_is(cells, run)) for i, run in enumerate(cells) if run["method"] == "mappo_l"]
+        p = holm([u_test(scores[i]["end"], scores[j]["end"]) for i, j in pairs])
+        corrected = {i: value for (i, _), value in zip(pairs, p, strict=True)}
+        for i, (run, own) in enumerate(zip(cells, scores, strict=True)):
+            base = baseline(run, cells)
+            less = "-" if base is None or base is run else difference(own, scores[cells.index(base)])
+            line = [task, f"{share(run):g}", label(run, [x for x in cells if share(x) == share(run)])]
+            line += [mean_sd(own["end"]), mean_sd(own["training"]), less, mean_sd(own["reward"])]
+            body.append([*line, _unsafe(run, own), p_value(corrected[i]) if i in corrected else "-"])
+    head = ["task", "p", "method", "true cost at the end", "true cost per 1,000 steps, training"]
+    head += ["less MAPPO-L's [95 %]", "reward", "unsafe seeds", "corrected p, F4SG's cost at the end"]
+    return markdown(head, body)
+
+
+def _fear_as_it_is(cells: Sequence[runs.Run], run: runs.Run) -> int:
+    """F4SG's cell with default settings at the p of `run`."""
+    return cells.index(_cell(cells, run["task"], share(run), **AS_IT_IS))
+
+
+def as_candidate(file: pathlib.Path) -> str:
+    """Question b in the second round: candidate C against each criterion of the preregistration."""
+    found = runs.load(file)
+    body = _while_training(found, ("voltage_33", "hand_over_2x6"), C, among=found)
+    body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), C, among=found)
+    return _as_criteria(body, "candidate C")
+
+
+def as_candidate_late(file: pathlib.Path) -> str:
+    """Candidate C of the second round on the ant, read at the last update of the three cells; an exploration."""
+    return _as_criteria(_at_the_end(runs.load(file), (("ant_2x4", 0.03),), C), "candidate C, read later")
+
+
+def as_candidate_a(file: pathlib.Path) -> str:
+    """Question b in the third round: candidate A against the same criteria, beside cells of the second round."""
+    found = [run for run in runs.load(file) if run["method"] == "f4sg"] + _second(file)
+    usual = {"lr_half_life": np.inf}
+    body = _while_training(found, ("voltage_33",), A, **usual) + _while_training(found, ("hand_over_2x6",), A)
+    body += _at_the_end(found, (("ant_2x4", 0.03),), A) + _at_the_end(found, (("voltage_33", 0.05),), A, **usual)
+    return _as_criteria(body, "candidate A")
+
+
+def as_candidate_half_life(file: pathlib.Path) -> str:
+    """Question b in the third round: candidate C on the grid with a half-life, and what the half-life alone does."""
+    found = runs.load(file)
+    body = _while_training(found, ("voltage_33",), C, lr_half_life=2e5)
+    body += _at_the_end(found, (("voltage_33", 0.05),), C, lr_half_life=2e5)
+    halving, without = _read(
+        [
+            _cell(found, "voltage_33", 1.0, method="mappo_l", lr_half_life=2e5),
+            _cell(_second(file), "voltage_33", 1.0, method="mappo_l"),
+        ]
+    )
+    for name, what, sign in (("reward", "reward", -1), ("end", "true cost", 1)):
+        p = u_test(halving[name], without[name])
+        worse = p < 0.05 and sign * (halving[name].mean() - without[name].mean()) > 0
+        text = f"{mean_sd(halving[name])}; {mean_sd(without[name])}; p {p_value(p)}"
+        body.append(["4", f"MAPPO-L's {what} at the end, beside a constant learning rate's, p = 1", text, not worse])
+    return _as_criteria(body, "with `lr_half_life` 2e5")
+
+
+def _while_training(
+    found: Sequence[runs.Run],
+    tasks: Sequence[str],
+    candidate: dict[str, Any],
+    among: Sequence[runs.Run] = (),
+    **more: Any,
+) -> list:
+    """Criterion 1: true cost while training within 1 of MAPPO-L's in 1,000 steps, its interval below 5."""
+    body = []
+    for task in tasks:
+        cells = [_cell(found, task, 1.0, method="f4sg", **candidate, **more)]
+        cells.append(_cell(found, task, 1.0, method="mappo_l", **more))
+        own, base = _read(cells, [run for run in among if run["task"] == task])
+        middle, half = welch(own["training"], base["training"])
+        what = f"true cost while training, less MAPPO-L's, `{task}`, p = 1"
+        body.append(["1", what, difference(own, base), middle < 1 and middle + half < 5])
+    return body
+
+
+def _at_the_end(
+    found: Sequence[runs.Run],
+    where: Sequence[tuple[str, float]],
+    candidate: dict[str, Any],
+    among: Sequence[runs.Run] = (),
+    **more: Any,
+) -> list:
+    """Criteria 2 and 3: true cost no worse than F4SG's as it is and below MAPPO-L's, reward nearly F4SG's."""
+    body = []
+    for task, seen in where:
+        wanted = ({"method": "f4sg", **candidate}, AS_IT_IS, {"method": "mappo_l", "lambda_kp": 0.0})
+        cells = [_cell(found, task, seen, **cell, **more) for cell in wanted]
+        own, usual, base = _read(cells, [run for run in among if run["task"] == task])
+        at = f"`{task}`, p = {seen:g}"
+        ends = [mean_sd(x["end"]) for x in (own, usual, base)]
+        above, below = u_test(own["end"], usual["end"]), u_test(own["end"], base["end"])
+        worse = above < 0.05 and probability_of_improvement([own["end"]], [usual["end"]]) > 0.5
+        what = f"{ends[0]}; {ends[1]}; p {p_value(above)}"
+        body.append(["2", f"true cost at the end beside F4SG's, {at}", what, not worse])
+        what = f"{ends[0]}; {ends[2]}; p {p_value(below)}"
+        lower = below < 0.01 and probability_of_improvement([own["end"]], [base["end"]]) < 0.5
+        body.append(["2", f"true cost at the end below MAPPO-L's, {at}", what, lower])
+        ant = task.startswith("ant")
+        least = 0.9 * usual["reward"].mean() if ant else usual["reward"].mean() - usual["reward"].std(ddof=1)
+        text = f"{mean_sd(own['reward'])}; at least {least:.{0 if ant else 2}f}"
+        body.append(["3", f"reward at the end, {at}", text, own["reward"].mean() >= least])
+    return body
+
+
+def _as_criteria(body: list, name: str) -> str:
+    body = [[*line, "yes" if holds else "**no**"] for *line, holds in sorted(body, key=lambda line: line[0])]
+    return markdown(["criterion", "measure", name, "holds"], body)
+
+
+def as_lag_in_time(file: pathlib.Path) -> str:
+    """Question b: fear of costly and of other steps on the hands in the first updates, as it is and candidate A's."""
+    cells = [_cell(_second(file), "hand_over_2x6", 1.0, **AS_IT_IS), _cell(runs.load(file), "hand_over_2x6", 1.0, **A)]
+    updates = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24)  # one point of the curves each
+    body = []
+    for run in cells:
+        for name, what in (("on_costly", "a step felt as costly"), ("on_safe", "others")):
+            found = run["diagnostics"][f"fear/{name}"]
+            body.append([label(run, cells), what, *(f"{found[update - 1]:.2f}" for update in updates)])
+    return markdown(["method", "mean fear of", *(f"update {update}" for update in updates)], body)
+
+
+def as_half_life(file: pathlib.Path) -> str:
+    """Question b in the third round: a half-life on the grid, beside MAPPO-L with it at the same p."""
+    found = [run for run in runs.load(file) if settings(run)["lr_half_life"] == 2e5]
+    groups = [[x for x in found if share(x) == seen] for seen in (1.0, 0.05)]
+    return beside([_first(cells, method="mappo_l") for cells in groups])
+
+
+def as_batch(file: pathlib.Path) -> str:
+    """Question a in the third round: MAPPO-L with four times the environments, beside the first and the second round.
+
+    Rows are read at the same number of updates, so the larger batch has had four times the steps.
+    """
+    batch = _cell(runs.load(file), "ant_2x4", 0.03, method="mappo_l", num_envs=1536)
+    first = runs.load(file.with_name("study_ant_2x4_h200.json"))
+    usual = {"method": "mappo_l", "lambda_kp": 0.0, "lambda_init": 2.0}
+    pairs = [[_cell(found, "ant_2x4", 0.03, **cell) for cell in (AS_IT_IS, usual)] for found in (_second(file), first)]
+    return beside([[*pair, batch] for pair in pairs])
+
+
+def as_sway(file: pathlib.Path) -> str:
+    """Question e: a corridor that moves, seen and hidden; F4SG and R4SG beside MAPPO-L."""
+    found = [run for run in runs.load(file) if settings(run)["sway"] != "none"]
+    groups = [[x for x in found if settings(x)["sway"] == sway] for sway in ("seen", "hidden")]
+    return beside([_first(cells, method="mappo_l") for cells in groups])
+
+
+def as_responses(file: pathlib.Path) -> str:
+    """Question c under noise: the variants of R4SG on the grid beside MAPPO-L of the second round."""
+    variants = [run for run in runs.load(file) if run["method"] == "r4sg" and run["task"] == "voltage_33"]
+    return beside([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
+
+
+def as_prior(file: pathlib.Path) -> str:
+    """Question d: F4SG with the fear of another task from the first step on, beside F4SG that starts afresh."""
+    return beside([_prior_last(file)])
+
+
+def as_prior_in_time(file: pathlib.Path) -> str:
+    """Question d: fear of the steps that are felt as costly, and true cost, in each tenth of the run; seeds' means."""
+    body = []
+    for run in _prior_last(file):
+        fear = run["diagnostics"]["fear/on_costly"]
+        cost = 1000 * np.nanmean(np.array(run["true_step_cost"], float), axis=0)
+        name = label(run, _prior_last(file))
+        body.append([name, "fear of a step felt as costly", *(f"{x:.2f}" for x in fear)])
+        body.append([name, "true cost per 1,000 steps", *(f"{x:.0f}" for x in cost)])
+    return markdown(["method", "mean", *(f"to {x / 1e6:.1f} M" for x in run["steps"])], body)
+
+
+def _prior_last(file: pathlib.Path) -> list[runs.Run]:
+    return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
+
+
+def beside(groups: Sequence[Sequence[runs.Run]]) -> str:
+    """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure."""
+    scores = [_read(cells) for cells in groups]
+    pairs = [(i, j) for i, cells in enumerate(groups) for j in range(1, len(cells))]
+    corrected = [holm([u_test(scores[i][j][name], scores[i][0][name]) for i, j in pairs]) for name in MEASURES]
+    every = [run for cells in groups for run in cells]
+    body = []
+    for i, cells in enumerate(groups):
+        for j, (run, own) in enumerate(zip(cells, scores[i], strict=True)):
+            p = ", ".join(p_value(x[pairs.index((i, j))]) for x in corrected) if j else "-"
+            less = difference(own, scores[i][0]) if j else "-"
+            line = [f"{share(run):g}", label(run, every), str(run["seeds"][0]), mean_sd(own["end"])]
+            body.append([*line, mean_sd(own["training"]), less, mean_sd(own["reward"]), _unsafe(run, own), p])
+    head = ["p", "method", "seeds from", "true cost at the end", "true cost per 1,000 steps, training"]
+    head += ["less the first row's [95 %]", "reward", "unsafe seeds", "corrected p: end, training, reward"]
+    return markdown(head, body)
+
+
+def _second(file: pathlib.Path) -> list[runs.Run]:
+    return runs.load(file.with_name("study_second_h200.json"))
+
+
+def _cell(found: Sequence[runs.Run], task: str, seen: float, **wanted: Any) -> runs.Run:
+    """The first run of the task, of this share of felt costs, with these settings."""
+    wanted |= {"cost_seen": seen}
+    return next(run for run in found if run["task"] == task and settings(run).items() >= wanted.items())
+
+
+def _first(cells: Sequence[runs.Run], method: str) -> list[runs.Run]:
+    """`cells`, those of the method first."""
+    return sorted(cells, key=lambda run: run["method"] != method)
+
+
+def _read(cells: Sequence[runs.Run], among: Sequence[runs.Run] = ()) -> list[dict[str, Scores]]:
+    """The measures of each cell at the last update that all of them, and all of `among`, reached."""
+    last = min(max(run["steps"]) / _environments(run) for run in (*cells, *among))
+    return [measures(run, last * _environments(run)) for run in cells]
+
+
+def _environments(run: runs.Run) -> int:
+    return settings(run).get("num_envs", Config.num_envs)
+
+
+def _unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
+    """How many seeds end beyond the limit."""
+    return f"{(own['end'] > run['cost_limit'] / share(run)).sum()} of {len(own['end'])}"
+
+
+FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+    "second": as_second,
+    "candidate": as_candidate,
+    "candidate_late": as_candidate_late,
+    "candidate_a": as_candidate_a,
+    "candidate_half_life": as_candidate_half_life,
+    "lag_in_time": as_lag_in_time,
+    "half_life": as_half_life,
+    "larger_batch": as_batch,
+    "sway": as_sway,
+    "responses": as_responses,
+    "prior": as_prior,
+    "prior_in_time": as_prior_in_time,
+}
