@@ -4,6 +4,7 @@ python -m bench list                           what is measured, and how long it
 python -m bench run                            everything, into bench/results; then the documentation's tables
 python -m bench run --quick                    does everything run? minutes, into a folder of its own
 python -m bench run ant grid                   some of it
+python -m bench peers --quick                  training beside brax, JaxMARL, PyTorch and plain loops
 python -m bench compare HEAD~5 bench/results   results as files, folders or git revisions
 python -m bench render --check                 are the documentation's tables what bench/results says?
 python -m bench store RUN... -o FILE.json      training runs as a result for tables and pictures
@@ -52,6 +53,12 @@ def _add_measuring(commands: Any) -> None:
     one = command(commands, "measure", _measure, "run one bench in this process, as `run` does in another")
     one.add_argument("name", choices=BENCHES)
     one.add_argument("--out", type=pathlib.Path, required=True, help="a JSON file")
+    peers = command(commands, "peers", _peers, "train beside brax, JaxMARL, PyTorch and plain loops, for the same time")
+    peers.add_argument(
+        "--out", type=pathlib.Path, help="a JSON file (default: in bench/results; with --quick a new one)"
+    )
+    peers.add_argument("--jaxmarl", type=pathlib.Path, metavar="FOLDER", help="a clone of JaxMARL, for its trainer")
+    peers.add_argument("--quick", action="store_true", help="one turn of a few seconds each")
     for parser in (every, one):
         parser.add_argument("--quick", action="store_true", help="a smoke: few cases, few repeats")
         parser.add_argument("--threads", type=whole(0), default=0, help="use so many of the CPU's")
@@ -94,6 +101,12 @@ def _run_benches(arguments: argparse.Namespace) -> int:
 def _measure(arguments: argparse.Namespace) -> int:
     runner.measure(arguments.name, arguments.out, arguments.quick, arguments.threads, arguments.only, say)
     return 0
+
+
+def _peers(arguments: argparse.Namespace) -> int:
+    from .peers import contest  # which imports what the learners need
+
+    return contest.run(arguments.out, arguments.quick, arguments.jaxmarl, say)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

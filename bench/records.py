@@ -25,7 +25,7 @@ Report = dict[str, Any]  # conditions and rows
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "warp-lang", "numpy")
-PACKAGES += ("pandapower", "lightsim2grid", "power-grid-model", "orbax-checkpoint")
+PACKAGES += ("pandapower", "lightsim2grid", "power-grid-model", "orbax-checkpoint", "brax", "jaxmarl", "torch")
 _BEGIN = time.monotonic()
 
 

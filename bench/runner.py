@@ -36,10 +36,10 @@ def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: in
       0; 1 where one failed, which does not stop the others; 130 after Ctrl-C, which keeps what is finished.
     """
     partly = quick or bool(threads) or bool(only)
-    benches, out = chosen(names), _folder(out, partly)
+    benches, out = chosen(names), folder(out, partly)
     out.mkdir(parents=True, exist_ok=True)
     committed = _committed(say)
-    count, device = _devices() if any(BENCHES[name].on != "cpu" for name in benches) else (0, "cpu")
+    count, device = devices() if any(BENCHES[name].on != "cpu" for name in benches) else (0, "cpu")
     done, failed, stopped = [], [], False
     for number, name in enumerate(benches, 1):
         bench = BENCHES[name]
@@ -93,7 +93,7 @@ def slug(device: str) -> str:
     return re.sub("[^a-z0-9]+", "_", device.lower().removeprefix("nvidia ")).strip("_")
 
 
-def _folder(out: pathlib.Path | None, partly: bool) -> pathlib.Path:
+def folder(out: pathlib.Path | None, partly: bool) -> pathlib.Path:
     """Where results go.
 
     Raises:
@@ -136,7 +136,7 @@ def _missing(bench: Bench, count: int, device: str) -> str | None:
     return "no GPU" if device == "cpu" else "one GPU only" if bench.on == "gpus" and count == 1 else None
 
 
-def _devices() -> tuple[int, str]:
+def devices() -> tuple[int, str]:
     """How many devices JAX sees and their kind, asked in another process, since whoever asks takes their memory."""
     asked = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=False)
     if asked.returncode:

@@ -105,6 +105,10 @@ def _compile_times_mappo_l(row: Row, rows: Rows) -> float | None:
     return row["compile_seconds"] / reference[0]["compile_seconds"] if reference and "compile_seconds" in row else None
 
 
+def _of_mappo_l(row: Row, rows: Rows) -> float | None:
+    return _over(row, rows, name="pmt train, MAPPO-L")
+
+
 def _ours(row: Row, rows: Rows) -> list[float]:
     """Our rate in 32 bits, same network and batch, over that of this row, turn by turn."""
     same = {name: row.get(name) for name in ("kind", "task", "num_envs")}
@@ -142,8 +146,18 @@ def _rate_or_failure(row: Row, rows: Rows) -> str:
     return f"failed: {row['failed'].split(':')[0]}" if "failed" in row else f"{rate(row):,.0f}"
 
 
+def _turns(name: str) -> Callable[[Row, Rows], str]:
+    """The mean over turns of what stands in the row under that name, with the lowest and highest."""
+
+    def cell(row: Row, rows: Rows) -> str:
+        found = row.get(name)
+        return f"{statistics.mean(found):.2f} ({min(found):.2f} to {max(found):.2f})" if found else "-"
+
+    return cell
+
+
 def _sizes(*names: str) -> Callable[[Row, Rows], str]:
-    return lambda row, rows: " x ".join(f"{row[name]:,}" for name in names)
+    return lambda row, rows: " x ".join(f"{row[name]:,}" for name in names if name in row) or "-"
 
 
 def _ours_cell(row: Row, rows: Rows) -> str:
@@ -153,6 +167,14 @@ def _ours_cell(row: Row, rows: Rows) -> str:
 
 
 COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
+    "program": _shown("{}", "name"),
+    "physics": _shown("{}", "physics"),
+    "environments x steps": _sizes("num_envs", "rollout_length"),
+    "epochs x minibatches": _sizes("epochs", "minibatches"),
+    "networks; cost": _shown("{}", "networks"),
+    "of pmt train, MAPPO-L": _shown("{:.2f}", _of_mappo_l),
+    "turns' reward": _turns("rewards"),
+    "turns' cost": _turns("costs"),
     "": _contestant,
     "task": _shown("{}", "task"),
     "what": _shown("{}", "what"),
@@ -241,7 +263,7 @@ def hub(reports: Reports) -> str:
     return f"{markdown(head, body)}\n\n{len(rows)} policies, {total / 1000:.0f} kB in all."
 
 
-def peers(reports: Reports) -> str:
+def beside(reports: Reports) -> str:
     """Speed in four rows, beside what one would use instead."""
     ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
     (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
@@ -309,5 +331,13 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
     "hub": hub,
-    "peers": peers,
+    "beside": beside,
+    "peers": Table(
+        "peers",
+        ("peer",),
+        (
+            *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
+            *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost", "first update, s"),
+        ),
+    ),
 }

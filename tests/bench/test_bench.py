@@ -88,7 +88,7 @@ def test_what_a_machine_lacks_is_skipped(
     fakes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int, device: str, skipped: list
 ):
     out = fakes("first", "second", "third", second="gpu", third="gpus")
-    monkeypatch.setattr(runner, "_devices", lambda: (count, device))
+    monkeypatch.setattr(runner, "devices", lambda: (count, device))
     assert main(["run", "--out", str(out)]) == 0
     names = ["first", "second_h200", "third_h200"][: 3 - len(skipped)]
     assert sorted(path.stem for path in out.iterdir()) == names
