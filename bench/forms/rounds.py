@@ -66,7 +66,7 @@ def as_candidate_late(file: pathlib.Path) -> str:
 
 def as_candidate_a(file: pathlib.Path) -> str:
     """Question b in the third round: candidate A against the same criteria, beside cells of the second round."""
-    found = [run for run in runs.load(file) if run["method"] == "f4sg"] + _second(file)
+    found = [run for run in runs.load(file) if settings(run)["emotion_lr"] == A["emotion_lr"]] + _second(file)
     body = _while_training(found, ("voltage_33", "hand_over_2x6"), A)
     body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), A)
     return _as_criteria(body, "candidate A")
