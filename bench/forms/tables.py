@@ -284,6 +284,50 @@ def beside(reports: Reports) -> str:
     return markdown(head, body)
 
 
+def limits(reports: Reports) -> str:
+    """Training beside its environment alone, where both were measured at the same size."""
+    ant, engines, loop, scaling = (
+        reports[name]["rows"] for name in ("ant", "engines_h200", "loop_h200", "scaling_h200")
+    )
+    (cpu,), (cpu_alone,) = (
+        matching(ant, kind=kind, physics="mujoco", num_envs=256) for kind in ("training", "environment")
+    )
+    (five,) = matching(loop, method="mappo_l", seeds=5, num_envs=2048)
+    (five_alone,) = matching(engines, task="ant_2x4", seeds=5, num_envs=2048)
+    (one,) = matching(scaling, task="ant_2x4", what="one device")
+    (one_alone,) = matching(engines, task="ant_2x4", physics="warp", seeds=1, num_envs=4096)
+    body = []
+    for machine, row, alone in (
+        (f"{reports['ant']['machine']['cpu']}, 2 threads", cpu, cpu_alone),
+        (f"1 {reports['loop_h200']['device']}", one, one_alone),
+        (f"1 {reports['loop_h200']['device']}", five, five_alone),
+    ):
+        speeds = [row["steps_per_second"], alone["steps_per_second"]]
+        size = _sizes("seeds", "num_envs", "rollout_length")(row, [])
+        body.append([machine, size, *(f"{x:,.0f}" for x in speeds), f"{speeds[0] / speeds[1]:.2f}"])
+    head = (
+        "machine",
+        SIZES,
+        "training, steps/s",
+        "environment alone, steps/s",
+        "share of the update that is environment",
+    )
+    return markdown(head, body)
+
+
+def side_by_side(reports: Reports) -> str:
+    """Five seeds in one program on one GPU, beside one."""
+    rows = matching(reports["loop_h200"]["rows"], method="mappo_l")
+    body = []
+    for one in matching(rows, seeds=1):
+        (five,) = matching(rows, seeds=5, num_envs=one["num_envs"], rollout_length=one["rollout_length"])
+        size = _sizes("num_envs", "rollout_length")(one, [])
+        body.append([size, _rate_or_failure(one, []), _rate_or_failure(five, []), f"{_times_one_seed(five, rows):.2f}"])
+    return markdown(
+        ("environments x steps", "one seed, steps/s", "five seeds, steps/s", "time of an update, x one seed"), body
+    )
+
+
 SPEED = ("", "engine", "environments", "environment steps/s", "of plain loop x threads")
 CPU_SECONDS = ("the same per CPU-second", "trace, CPU-s", "compile, CPU-s")
 EVERY = ("plain loop", "environment", "training")
@@ -332,6 +376,8 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     ),
     "hub": hub,
     "beside": beside,
+    "limits": limits,
+    "side_by_side": side_by_side,
     "peers": Table(
         "peers",
         ("peer",),

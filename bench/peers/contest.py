@@ -75,7 +75,11 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
     out = out or folder / ("peers.json" if device == "cpu" else f"peers_{runner.slug(device)}.json")
     shape = (16, 16) if quick else (64, 64) if device == "cpu" else (2048, 8)
     sizes: dict[str, int] = dict(zip(SIZES, (*shape, 5, 8), strict=True))
+    flags = " --quick" * quick + " --jaxmarl FOLDER" * bool(jaxmarl)
     turns: dict[str, list[Row]] = {name: [] for name in PEERS}
+    cache = tempfile.TemporaryDirectory()  # of compiled programs, empty in the first turn
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = cache.name
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # who only names the device takes no memory
     for turn in range(effort.turns):
         for name, peer in PEERS.items():
             if turns[name] and "failed" in turns[name][-1]:
@@ -83,9 +87,8 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
             seconds = effort.seconds if peer.task == learners.TASK else effort.elsewhere
             turns[name].append(figures(_turn(name, seconds, turn, sizes, jaxmarl), seconds))
             say(f"[{turn + 1}/{effort.turns}] {peer.name}: {turns[name][-1]}")
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # to name the device takes none of its memory
-    rows = [row(peer, sizes, turns[name]) for name, peer in PEERS.items()]
-    records.write(out, rows, f"python -m bench peers{' --quick' * quick}{' --jaxmarl FOLDER' * bool(jaxmarl)}")
+        rows = [row(peer, sizes, turns[name]) for name, peer in PEERS.items()]
+        records.write(out, rows, f"python -m bench peers{flags}")
     say(f"in {out}")
     return int("failed" in turns["mappo_l"][-1])
 
@@ -100,7 +103,11 @@ def _turn(name: str, seconds: float, seed: int, sizes: dict[str, int], jaxmarl: 
         with errors.open("w") as said:
             try:
                 code = subprocess.run(
-                    words, stdout=subprocess.DEVNULL, stderr=said, timeout=seconds + COMPILING, check=False
+                    words,
+                    stdout=subprocess.DEVNULL,
+                    stderr=said,
+                    timeout=seconds + COMPILING,
+                    check=False,
                 ).returncode
             except subprocess.TimeoutExpired:
                 return [{"failed": f"not ready after {COMPILING:.0f} s"}]
@@ -128,17 +135,16 @@ def figures(lines: Lines, seconds: float) -> Row:
 
 
 def row(peer: Peer, sizes: dict[str, int], turns: list[Row]) -> Row:
-    """A peer's row: medians of rates and seconds, and reward and cost of each turn."""
+    """A peer's row: median rate, seconds of a cold start to the first update, reward and cost of each turn."""
     about = {"kind": "peer", "name": peer.name, "task": peer.task, "networks": peer.networks}
     about |= sizes if peer.networks != "none" else {}
     if "failed" in turns[-1]:
         return about | turns[-1]
-    medians = {
-        name: statistics.median(turn[name] for turn in turns) for name in ("first_update_seconds", "other_work_cpus")
-    }
-    facts = {name: x for name, x in turns[0].items() if isinstance(x, str) or name == "threads"}
+    others = {"other_work_cpus": statistics.median(turn["other_work_cpus"] for turn in turns)}
+    first = ("physics", "learner", "threads", "first_update_seconds")  # the first turn compiles, others load
+    facts = {name: turns[0][name] for name in first if name in turns[0]}
     scores = {
         f"{name}s": [turn[name] for turn in turns] for name in ("reward", "cost") if all(name in x for x in turns)
     }
     rates = [turn["rate"] for turn in turns]
-    return about | facts | {"steps_per_second": statistics.median(rates), "rates": rates} | medians | scores
+    return about | facts | {"steps_per_second": statistics.median(rates), "rates": rates} | others | scores
