@@ -209,6 +209,15 @@ BENCHES = {
         (Case("checkpoint", "ant_2x4", method="mixed", num_envs=256),),
         (Case("checkpoint", "lane", method="mixed", num_envs=16),),
     ),
+    "start": Bench(
+        "GPU: seconds from `pmt train` to its first update, with empty caches and with those of the first start",
+        tuple(
+            Case("start", "ant_2x4", what, method="mappo_l", num_envs=2048, rollout_length=8)
+            for what in ("empty cache", "second start")
+        ),
+        (Case("start", "lane", "empty cache", method="mappo_l"),),
+        on="gpu",
+    ),
     "engines": Bench(
         "GPU: environment steps/s per engine and size; seconds to compile",
         (

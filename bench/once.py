@@ -30,10 +30,11 @@ from .cases import Case
 from .records import Row
 
 CHUNKS, SAVES = 8, 8
+CACHES = ("XDG_CACHE_HOME", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")  # of JAX, of Warp's kernels, of the driver
 
 
 def start(case: Case) -> Row:
-    """Trains in a process of its own with an empty compile cache; the second start has what the first left in it."""
+    """Trains in a process of its own with empty caches; the second start has what the first left in them."""
     with tempfile.TemporaryDirectory() as folder:
         if case.what == "second start":
             _train(pathlib.Path(folder), case)
@@ -47,7 +48,8 @@ def _train(folder: pathlib.Path, case: Case) -> Row:
     command += ["--out", str(out), "--steps", str(2 * case.num_envs * case.rollout_length or 4096)]
     if case.rollout_length:
         command += ["--num-envs", str(case.num_envs), "--rollout-length", str(case.rollout_length)]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment |= {name: str(folder / name) for name in CACHES}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     begin, first = time.perf_counter(), None
     with open(folder / f"{out.name}.log", "w+") as log:
@@ -61,10 +63,11 @@ def _train(folder: pathlib.Path, case: Case) -> Row:
         said = log.read()
     if done[1] != 0 or (compiled := re.search(r"compiled in ([0-9.]+) s \(compile cache (\w+)\)", said)) is None:
         raise RuntimeError(f"{' '.join(command)} failed: {said.strip().splitlines()[-1]}")
-    usage = done[2]
+    usage, kernels = done[2], re.search(r"kernels ready after ([0-9.]+) s", said)
     return {
         "cache": compiled[2],
         "compile_seconds": float(compiled[1]),
+        **({"kernel_seconds": float(kernels[1])} if kernels else {}),
         "first_update_seconds": round(first or time.perf_counter() - begin, 2),
         "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
         "memory_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
@@ -32,6 +32,7 @@ __all__ = [
     "installed_version",
     "felt_cost",
     "is_file",
+    "kernels",
     "make",
     "names",
     "options",
@@ -92,6 +93,13 @@ def baseline(env: Env, name: str) -> Policy:
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
     return known[name]()
+
+
+def kernels(env: Env) -> list[Callable[[], Any]]:
+    """What `env` needs compiled besides XLA's programs, which only Warp's physics does; calls for any threads."""
+    if env.engine != "warp":
+        return []
+    return importlib.import_module(f"{_envs().__name__}.physics.warp_kernels").needed()
 
 
 def columns(name: str) -> Mapping[str, Column]:

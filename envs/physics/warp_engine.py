@@ -4,6 +4,7 @@
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from . import warp_kernels
 from .contract import PhysicsState, Readout, needs_post_constraint, rest_state
 from .mjx_engine import load_state, read_state
 from .mjx_patches import import_mjx
@@ -27,6 +29,7 @@ class WarpEngine:
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None):
         mjx = import_mjx()
+        _quieten()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
         settings = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
@@ -36,6 +39,7 @@ class WarpEngine:
         # integrator's stages, so the substeps before the last go without.
         forces = {"opt._impl.run_rne_postconstraint": needs_post_constraint(readout)}
         self._last_model = self._model.tree_replace(forces)
+        warp_kernels.engines.add(self)
 
     def start(self) -> PhysicsState:
         return rest_state(self._c_model)
@@ -64,6 +68,19 @@ class WarpEngine:
 
         return jax.vmap(one)(state, ctrl)
 
+    def rehearse(self) -> None:
+        """The launches of `step`, which depend on no batch, for one world and without XLA; see `warp_kernels`."""
+        from mujoco.mjx.third_party import mujoco_warp
+
+        model = mujoco_warp.put_model(self._c_model)
+        if model.opt.broadphase != mujoco_warp.BroadphaseType.NXN or model.nflex:
+            return  # its sorts are no kernels of Warp's: they would run, on what no kernel has written
+        model.opt.warn_overflow, model.ncam, model.nlight = False, 0, 0
+        model.opt.run_rne_postconstraint = needs_post_constraint(self._readout)
+        model.opt.graph_conditional = False  # a loop in a graph asks the device when to end
+        data = mujoco_warp.make_data(self._c_model, nworld=1, naconmax=self._contacts, njmax=self._rows)
+        mujoco_warp.step(model, data)
+
     def _make_data(self, batch: int) -> Any:
         """Warp keeps the contacts of all worlds in one buffer, so its size depends on the batch."""
         mjx = import_mjx()
@@ -75,6 +92,14 @@ class WarpEngine:
             return jnp.broadcast_to(leaf[:1], leaf.shape) if large else leaf
 
         return jax.tree.map(slim, data)
+
+
+def _quieten() -> None:
+    """Keeps Warp's lines about itself and every kernel to those who ask this package's logger for information."""
+    import warp
+
+    asked = logging.getLogger(__name__).isEnabledFor(logging.INFO)
+    warp.config.log_level = warp.LOG_INFO if asked else warp.LOG_WARNING
 
 
 def _constant(make: Callable[[], Any]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import pathlib
 from typing import Any
 
@@ -43,6 +44,7 @@ def add(commands: Any) -> None:
     output.add_argument(
         "--debug", action="store_true", help="stop at the first number that is not finite and name its tensor; slower"
     )
+    output.add_argument("--verbose", action="store_true", help="show what Warp prints about each of its kernels")
     add_cache(output)
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
@@ -59,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--resume needs --out, the folder of the run to continue")
     if arguments.change and not arguments.resume:
         raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
+    if arguments.verbose:
+        logging.getLogger("envs").setLevel(logging.INFO)
     from ..policies import warm_start
     from ..training import processes, trainer
 

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import itertools
 import os
 import pathlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import tasks
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
 from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 from ..output import Say
+
+KERNEL_LINES = 5.0  # seconds between two of them
+KERNEL_THREADS = max(1, min(8, (os.cpu_count() or 1) - 1))  # one CPU is XLA's; Warp writes one source at a time
 
 
 class Programs(NamedTuple):
@@ -73,6 +79,16 @@ def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     config = setup.config
     say(f"compiling {config.log_interval} update(s) of {config.method} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
+    with compiling(_kernels(setup, say), say):
+        state, programs, found = _compile_programs(setup, say)
+        later = "; the first row compiles the checks of --debug" if setup.debug else ""
+        say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found}){later}")
+    return state, programs
+
+
+def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, str]:
+    """`compile_run`'s state and programs, and what the compile cache had of them: hit, miss or off."""
+    config = setup.config
     hyper, keys, axes = setup.vmap_arguments
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
     placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys))
@@ -94,9 +110,44 @@ def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
         with sharding.use_mesh(setup.mesh):
             evaluation = program.lower(state).compile()
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
-    later = "; the first row compiles the checks of --debug" if setup.debug else ""
-    say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found}){later}")
-    return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1))
+    return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1)), found
+
+
+def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
+    """What the physics needs besides XLA's programs."""
+    try:
+        return tasks.kernels(setup.vector.env)
+    except Exception as error:  # found through private places of Warp; without them it compiles as it goes
+        say(f"the first update compiles the physics' kernels: {error}")
+        return []
+
+
+@contextlib.contextmanager
+def compiling(kernels: Sequence[Callable[[], Any]], say: Say) -> Iterator[None]:
+    """Compiles the physics' kernels on threads beside what is done inside, and waits for them at its end.
+
+    One that cannot be compiled raises when it is first launched.
+    """
+    begin = said = time.monotonic()
+    done = itertools.count(1)
+
+    def show(_: Any) -> None:
+        nonlocal said
+        count, now = next(done), time.monotonic()
+        if count == len(kernels):
+            say(f"{count} kernels ready after {now - begin:.1f} s")
+        elif now - said >= KERNEL_LINES:
+            said = now
+            say(f"compiling kernels: {count} of {len(kernels)} ...")
+
+    with concurrent.futures.ThreadPoolExecutor(KERNEL_THREADS) as pool:
+        for kernel in kernels:
+            pool.submit(kernel).add_done_callback(show)
+        try:
+            yield
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _health(state: LearnerState) -> Metrics:

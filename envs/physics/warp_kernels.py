@@ -1,0 +1,69 @@
+"""Warp's kernels before the first step. Warp itself compiles each where it is first launched, one after the other.
+
+Which kernels a model needs is known only to MuJoCo-Warp's step, so a step is rehearsed: its launches are noted, and
+nothing runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+if TYPE_CHECKING:
+    from .warp_engine import WarpEngine
+
+engines: weakref.WeakSet[WarpEngine] = weakref.WeakSet()  # those that were built and still live
+
+_Launches = dict[tuple[Any, int], None]  # Warp's modules, and the threads a block that each is compiled for
+
+
+def needed() -> list[Callable[[], Any]]:
+    """What the steps of all engines launch; each entry compiles a part and loads it, on any thread.
+
+    Warp's unit is a module, most of which hold one kernel. A module that its cache holds is only loaded.
+    """
+    import warp
+
+    device = jax.local_devices()[0]
+    place = warp.get_cuda_device(device.local_hardware_id) if device.platform == "gpu" else warp.get_device("cpu")
+    with warp.ScopedDevice(place), _noted() as launches:
+        for engine in engines:
+            engine.rehearse()
+    return [functools.partial(module.load, place, block_dim=size) for module, size in launches]
+
+
+_HOOKING = threading.Lock()
+
+
+@contextlib.contextmanager
+def _noted() -> Iterator[_Launches]:
+    """Yields the launches of this thread, which do not happen: Warp launches nothing whose module does not load."""
+    import warp
+    from warp._src.context import Module
+
+    launches, thread = _Launches(), threading.get_ident()
+    load, suggest = Module.load, warp.get_suggested_block_size
+
+    def note(module: Any, device: Any, block_dim: int | None = None, *rest: Any, **named: Any) -> Any:
+        if threading.get_ident() != thread:
+            return load(module, device, block_dim, *rest, **named)
+        launches[module, block_dim or module.options["block_dim"]] = None
+
+    def note_asked(kernel: Any, device: Any = None) -> tuple[int, int]:
+        if threading.get_ident() != thread or not warp.get_device(device).is_cuda:
+            return suggest(kernel, device)
+        note(kernel.module, device)  # it is loaded to be asked
+        return 256, 1
+
+    with _HOOKING:
+        Module.load, warp.get_suggested_block_size = note, note_asked
+        try:
+            yield launches
+        finally:
+            Module.load, warp.get_suggested_block_size = load, suggest
