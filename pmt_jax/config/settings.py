@@ -122,6 +122,12 @@ class Hyper:
         0.05, "cost advantages are divided by their standard deviation, but never by less than this", NOT_NEGATIVE
     )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
+    emotion_lr_start: float = emotion(
+        0.0,
+        "learning rate of the fear and regret networks in the first update, if above emotion_lr; in update t it is "
+        "this over t, until it reaches emotion_lr",
+        NOT_NEGATIVE,
+    )
     fear_start: float = emotion(
         -4.0,
         "fear before any experience, as a logit: -4 is a probability of 0.018; nan takes the cost rate of the first "

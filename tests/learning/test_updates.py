@@ -113,6 +113,15 @@ def test_learning_rates_decay_beyond_two_to_the_31_steps():
     np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
 
 
+def test_the_learning_rate_of_emotions_falls_to_its_final_value():
+    setup = make_setup(load_config("lane", emotion_lr=1e-3, emotion_lr_start=1e-2))
+    updates = jnp.asarray([0, 1, 3, 9, 10, 2**31 - 1], jnp.int32)
+    rates = jax.vmap(lambda update: learner._annealed(setup, setup.hyper, update).emotion_lr)(updates)
+    np.testing.assert_allclose(rates, [1e-2, 5e-3, 2.5e-3, 1e-3, 1e-3, 1e-3], rtol=1e-6)
+    usual = dataclasses.replace(setup.hyper, emotion_lr_start=jnp.float32(0))
+    assert learner._annealed(setup, usual, updates[0]).emotion_lr == setup.hyper.emotion_lr
+
+
 @pytest.mark.full
 def test_learning_rates_of_all_networks_halve_in_their_half_life():
     made = program("mixed")
