@@ -10,6 +10,9 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
+import multiprocessing
+import os
 import statistics
 import subprocess
 import time
@@ -24,6 +27,7 @@ import envs
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training.compile import compile_run
+from pmt_jax.training.run_folder import MATMUL_PRECISION
 
 from . import grid, once, plain
 from .cases import Bench, Build, Case, Program
@@ -141,6 +145,8 @@ def environment(case: Case) -> Build:
 
 def training(case: Case) -> Build:
     """The training loop as `pmt train` compiles it; a call is one update, on a GPU eight."""
+    if case.processes > 1:
+        return functools.partial(_in_processes, case)
     updates = UPDATES["cpu" if jax.devices()[0].platform == "cpu" else "gpu"]
     steps = updates * case.num_envs * case.rollout_length
     sizes = {"seeds": case.seeds, "num_envs": case.num_envs, "rollout_length": case.rollout_length}
@@ -161,6 +167,40 @@ def training(case: Case) -> Build:
         return Program(call, case.seeds * steps, facts)
 
     return build
+
+
+def _in_processes(case: Case) -> Program:
+    """Each process trains its part of the seeds on its part of the CPUs; a call waits for one update of all."""
+    spawn, cpus, count = multiprocessing.get_context("spawn"), sorted(os.sched_getaffinity(0)), case.processes
+    part = dataclasses.replace(case, seeds=case.seeds // count, processes=1)
+    pipes = []
+    for i in range(count):
+        ours, theirs = spawn.Pipe()
+        mine = cpus[i * len(cpus) // count : (i + 1) * len(cpus) // count] or [cpus[i % len(cpus)]]
+        spawn.Process(target=_serve, args=(part, mine, theirs), daemon=True).start()
+        theirs.close()  # the process's end alone is left: where it dies, reading ends
+        pipes.append(ours)
+
+    def call() -> list[Any]:
+        for pipe in pipes:
+            pipe.send(None)
+        return [pipe.recv() for pipe in pipes]
+
+    steps = [pipe.recv() for pipe in pipes]  # once compiled
+    return Program(call, sum(steps))
+
+
+def _serve(case: Case, cpus: list[int], pipe: Any) -> None:
+    """A process of `_in_processes`: compiles, then does the program's work whenever it is told."""
+    os.sched_setaffinity(0, cpus)
+    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
+    program = training(case)()
+    pipe.send(program.steps)
+    with contextlib.suppress(EOFError):
+        while True:
+            pipe.recv()
+            program.call()
+            pipe.send(None)
 
 
 ONCE = {
@@ -220,10 +260,10 @@ def _medians(case: Case, turns: Sequence[Turn]) -> Row:
 
 
 class Watch:
-    """Seconds since it was made, CPU-seconds of this process, and how many CPUs others kept busy."""
+    """Seconds since it was made, CPU-seconds of this process and its children, and how many CPUs others kept busy."""
 
     def __init__(self) -> None:
-        self._begin, self._busy, self._cpu = time.perf_counter(), self._machine(), time.process_time()
+        self._begin, self._busy, self._cpu = time.perf_counter(), self._machine(), self._spent()
 
     @staticmethod
     def _machine() -> float:
@@ -236,7 +276,12 @@ class Watch:
 
     @property
     def own(self) -> float:
-        return time.process_time() - self._cpu
+        return self._spent() - self._cpu
+
+    @staticmethod
+    def _spent() -> float:
+        children = psutil.Process().children()
+        return time.process_time() + sum(child.cpu_times().user + child.cpu_times().system for child in children)
 
     @property
     def others(self) -> float:

@@ -136,6 +136,21 @@ def test_programs_take_turns_and_failures_are_rows(monkeypatch: pytest.MonkeyPat
     assert failed["failed"] == "UsageError: warp is missing" and "rates" not in failed
 
 
+@pytest.mark.full
+def test_processes_share_seeds_and_cpus():
+    case = Case("training", "lane", method="mappo_l", seeds=2, num_envs=4, rollout_length=5, processes=2)
+    program = measure.training(case)()
+    assert program.steps == 2 * 4 * 5
+    for _ in range(2):
+        assert program.call() == [None, None]
+
+
+@pytest.mark.full
+def test_a_process_that_dies_is_a_failure():
+    with pytest.raises(EOFError):
+        measure.training(Case("training", "no task", seeds=2, num_envs=4, processes=2))()
+
+
 def test_quick_and_only_choose_cases(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
     seen = []
     monkeypatch.setattr(measure, "rows", lambda bench, cases, effort, say: seen.append((cases, effort)) or [])
