@@ -1,4 +1,4 @@
-"""Batch, time limit, auto-reset and quarantine: the one place that knows about the ends of episodes."""
+"""Batch, time limit, auto-reset and quarantine: the one module that handles the ends of episodes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class VectorState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What one step brought, before any reset.
+    """The result of one step, before any reset.
 
     Attributes:
       reward: [B]; cost: [B, N, K]; info: {name: [B]}.

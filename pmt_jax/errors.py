@@ -1,11 +1,11 @@
-"""The one exception that the command line answers with a sentence instead of a traceback."""
+"""The one exception that the command line prints as a sentence, without a traceback."""
 
 import importlib
 import types
 
 
 class UsageError(ValueError):
-    """A user's mistake, told in one sentence: what was wrong, what was expected, what to do. Exit code 2."""
+    """A user's mistake, in one sentence: what was wrong, what was expected, what to do. Exit code 2."""
 
 
 def optional(module: str, extra: str) -> types.ModuleType:

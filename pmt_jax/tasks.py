@@ -62,7 +62,7 @@ def __getattr__(name: str) -> Any:
 
 
 def names() -> list[str]:
-    """The tasks that `make` knows."""
+    """The tasks that `make` builds."""
     return _envs().names()
 
 

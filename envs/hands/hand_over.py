@@ -114,7 +114,7 @@ CONSTRAINED = ("h0_ffproximal", "h0_ffmiddle", "h0_ffdistal")  # the geoms that 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Carry:
-    """What the hands remember between control steps.
+    """The state between control steps.
 
     Attributes:
       physics: the engine's state.

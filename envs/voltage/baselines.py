@@ -1,4 +1,4 @@
-"""What every grid engineer compares with: doing nothing, chance, IEEE 1547 droop, and optimal dispatch.
+"""The usual baselines: no reactive power, random actions, IEEE 1547 droop, and optimal dispatch.
 
 Each function makes a policy for an environment of `envs.voltage.control`: `policy(state) -> action` [N, 1], pure, to be
 jitted and vmapped like the environment itself.

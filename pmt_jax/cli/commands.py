@@ -1,4 +1,4 @@
-"""The commands that `pmt` knows, and how one of them is found and run."""
+"""The commands of `pmt`, and how one of them is found and run."""
 
 from __future__ import annotations
 

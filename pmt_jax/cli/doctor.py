@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def report(say: Callable[[str], None]) -> int:
-    """Says all findings; returns 0, or 1 where one is bad."""
+    """Prints all findings; returns 0, or 1 if one is bad."""
     bad = 0
     for finding in examine():
         say(f"{finding.mark:4}{finding.what:20}{finding.text}")

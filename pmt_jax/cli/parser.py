@@ -1,4 +1,4 @@
-"""argparse that answers with one sentence: the parser, types of arguments, and flags that several commands share."""
+"""argparse with errors of one sentence: the parser, types of arguments, and flags that several commands share."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
 
     source, words, draws = arguments.source, arguments.vary, arguments.random
     if has_parts(source) and (words or draws):
-        raise UsageError(f"{source} says itself what to sweep; leave out --set and --random")
+        raise UsageError(f"{source} already has a sweep; leave out --set and --random")
     if not (words or has_parts(source)):
         raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
     parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)

@@ -23,7 +23,7 @@ SEEDS = "seeds"  # the axis that a checked program is vmapped over
 
 
 class NotFinite(Exception):
-    """Says which tensor of which seed and update is not finite."""
+    """Names the tensor, the seed and the update that is not finite."""
 
 
 def check_finite(setup: Setup, update: jax.Array, **named: Any) -> None:

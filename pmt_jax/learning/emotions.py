@@ -150,7 +150,7 @@ def regret_weight(
 def appraise_fear(
     setup: Setup, hyper: Hyper, net: TrainState | None, batch: Batch, key: jax.Array
 ) -> tuple[TrainState | None, jax.Array, Metrics]:
-    """Learns from the observed costs first, then says how fearful every step was: [T, B, N, K] in (0, 1).
+    """Learns from the observed costs first, then computes the fear of every step: [T, B, N, K] in (0, 1).
 
     Without a fear prior network the signal is the cost itself, or what the method makes of the batch. Calibration is
     that of the network before it has seen the batch.

@@ -1,6 +1,6 @@
-"""How a run is split over devices: one mesh with the axes seed and env, and what the learner says to it.
+"""How a run is split over devices: one mesh with the axes seed and env, and the functions that the learner uses it with.
 
-Seeds never talk to each other, so as many devices as possible share the seeds; the rest share each seed's environments.
+Seeds exchange only metrics, so as many devices as possible share the seeds; the rest share each seed's environments.
 Environments step where they are (`apart`): physics engines are opaque to XLA's partitioner, which would hand every
 device all of them. The learner's rows are gathered once for each network's epochs (`shared`), every minibatch is cut
 into equal parts (`split`), and the partitioner sums the gradients. Random numbers do not depend on the split. Without a

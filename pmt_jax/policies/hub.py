@@ -32,7 +32,7 @@ _SCALE = "/scale"  # of the kernel whose path stands before it
 
 
 def is_name(source: str | pathlib.Path) -> bool:
-    """Whether a run's folder is in truth the name of a pretrained policy."""
+    """Whether a run's folder is the name of a pretrained policy."""
     return str(source).startswith(PREFIX)
 
 
@@ -89,7 +89,7 @@ def save(name: str, config: Config, state: ActingState, facts: dict[str, Any]) -
 
 
 def tell(name: str, facts: dict[str, Any]) -> None:
-    """Makes `about` answer with other facts from now on.
+    """Replaces the facts that `about` returns.
 
     Raises:
       UsageError: there is no such policy, or its file cannot be written.

@@ -78,7 +78,7 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
     for words, config in named:
         name = ",".join([f"task={_word(config.task)}"] * several + words) or "point"
         if repr(points.get(name, config)) != repr(config):
-            raise UsageError(f"two points are called '{name}': let `set` name what tells them apart")
+            raise UsageError(f"two points have the name '{name}': add the setting in which they differ to `set`")
         points[name] = config
     return points
 
@@ -109,7 +109,7 @@ def _check(part: Part) -> None:
         if FIELDS[name] not in (int, float):
             raise UsageError(f"'{name}' is not a number and has no range to draw from; list its values")
     if part.ranges and not part.draws:
-        raise UsageError(f"{next(iter(part.ranges))} has a range: say with --random N how many values to draw")
+        raise UsageError(f"{next(iter(part.ranges))} has a range: add --random N, the number of values to draw")
     if part.draws and not part.ranges:
         raise UsageError("random draws need a range, like --set lambda_lr=log:0.01:1")
 
@@ -175,7 +175,7 @@ def _range(text: Any) -> Range | None:
 
 
 def has_parts(source: str) -> bool:
-    """Whether `source` is a TOML file that says what to sweep."""
+    """Whether `source` is a TOML file with a sweep."""
     return source.endswith(".toml") and "sweep" in toml.read(source)
 
 
@@ -189,7 +189,7 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
     tables = shared.pop("sweep", [])
     tables = [tables] if isinstance(tables, dict) else tables
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
-        raise UsageError(f"{file} has no [sweep] table, and no --set says what to vary")
+        raise UsageError(f"{file} has no [sweep] table; add one, or --set NAME=VALUE,VALUE")
     return [_part(file, shared, dict(table)) for table in tables]
 
 

@@ -29,7 +29,7 @@ Say = Callable[[str], object]
 
 @dataclasses.dataclass(frozen=True)
 class RunLog:
-    """What a run folder says of a training run.
+    """A training run as its folder records it.
 
     Attributes:
       folder: where it lies.

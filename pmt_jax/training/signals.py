@@ -40,7 +40,7 @@ def noted() -> Iterator[list[int]]:
 
 
 class Interrupts:
-    """How a run answers signals: it ends at once, but after `save_first` it ends when the running chunk is saved.
+    """How a run handles signals: it ends at once, but after `save_first` it ends when the running chunk is saved.
 
     Python's handlers wait for C++ to return, from compiling or from a long chunk. A thread reads the signals at once.
 

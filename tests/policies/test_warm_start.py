@@ -96,7 +96,7 @@ def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp
     [
         ({"init": "nowhere"}, "nowhere is not a run folder"),
         ({"init": "{whole}", "hidden": "16"}, "actor of {whole} has other shapes than this run's"),
-        ({"init_fear": "{whole}", "method": "mappo_l"}, "init_fear is for methods that fear"),
+        ({"init_fear": "{whole}", "method": "mappo_l"}, "init_fear is for methods with a fear network"),
         ({"init_fear": "hub:ant_2x4/f4sg"}, "hub:ant_2x4/f4sg has no fear network"),
     ],
 )

@@ -21,7 +21,7 @@ from pmt_jax.studies import points, sweep
         (["--set", "method=happo,hapo"], "unknown method 'hapo'; did you mean 'happo'?"),
         (["--set", "task=lane,noisy"], "--set has one task"),
         ([], "nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table"),
-        (["--set", "clip=0.1:0.2"], "clip has a range: say with --random N how many values to draw"),
+        (["--set", "clip=0.1:0.2"], "clip has a range: add --random N, the number of values to draw"),
         (["--set", "clip=0.1,0.2", "--random", "3"], "random draws need a range"),
         (["--set", "clip=0.2:0.1", "--random", "3"], "a range is LOW:HIGH with LOW below HIGH"),
         (["--set", "clip=log:0:0.1", "--random", "3"], "both above 0 after log:, not 'log:0:0.1'"),
@@ -114,8 +114,8 @@ def test_a_file_lists_parts(tmp_path: pathlib.Path, monkeypatch, cli):
             'task = "lane"\n[sweep]\nextends = "noisy"',
             "extends another file only where the file above it names no task",
         ),
-        ('[[sweep]]\nextends = "lane"\nclip = 0.1\n[[sweep]]\nextends = "lane"', "two points are called 'point'"),
-        ('[sweep]\nextends = "lane"\nset.clip = "0.1:0.2"', "clip has a range: say with --random N"),
+        ('[[sweep]]\nextends = "lane"\nclip = 0.1\n[[sweep]]\nextends = "lane"', "two points have the name 'point'"),
+        ('[sweep]\nextends = "lane"\nset.clip = "0.1:0.2"', "clip has a range: add --random N"),
     ],
 )
 def test_mistakes_in_a_file_get_one_sentence(text: str, says: str, tmp_path: pathlib.Path, cli):

@@ -279,7 +279,7 @@ def broken(tmp_path: Path, file: str, change) -> Path:
         ("pv_active.csv", lambda x: [line.rsplit(",", 1)[0] for line in x], "6 columns, expected a time and 6 values"),
         ("load_reactive.csv", lambda x: x[:-5], "699 rows, load_reactive.csv has 694; they must be equal"),
         ("load_active.csv", lambda x: x[:50] + x[51:], "6 minutes from row 49 to 50, expected 3"),
-        ("load_active.csv", lambda x: [x[0]] + ["noon" + y[19:] for y in x[1:]], "'noon' is no time|need pandas"),
+        ("load_active.csv", lambda x: [x[0]] + ["noon" + y[19:] for y in x[1:]], "'noon' is not a time|need pandas"),
         ("load_active.csv", lambda x: [x[0]] + [y.replace(",0.0", ",500.0") for y in x[1:]], "looks like kW"),
         ("pv_active.csv", lambda x: [x[0]] + [y.replace(",0.", ",-0.") for y in x[1:]], "must not be negative"),
         ("pv_active.csv", lambda x: [x[0]] + [y.replace(",0.", ",a.") for y in x[1:]], "cannot be read as numbers"),
