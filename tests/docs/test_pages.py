@@ -22,6 +22,7 @@ NUMBER = rf"(?<![\w.,])(?<![\w.]-){DIGITS}(?!\w)"  # its sign does not count
 # Numbers of pages that no block has, and what they are: none is a measurement.
 STATED: dict[str, dict[str, str]] = {
     "README.md": {"versions of Python": "3.11 3.13", "band": "0.95 1.05", "bound of a test": "5e-5"},
+    "appendix/benchmarks.md": {"exit code": "130", "unit": "1e9", "day": "11"},
     "howto/compare.md": {"level of intervals": "95"},
     "howto/evaluate.md": {"level of intervals": "95"},
     "howto/export.md": {"bits": "32"},
@@ -105,27 +106,42 @@ def test_a_page_is_short(path: pathlib.Path):
     assert len(render.BLOCK.sub("", path.read_text()).split()) <= most
 
 
-@pytest.mark.parametrize("path", TYPED, ids=page)
-def test_numbers_come_from_results(path: pathlib.Path):
-    """Every number of a page stands in one of its blocks, perhaps with more digits, or is stated above.
+def typed(path: pathlib.Path) -> list[list[str]]:
+    """The numbers of each section of a page that are in none of its blocks, perhaps with more digits there, nor stated.
 
     Outside of the results, whole numbers up to ten are counts of what the page lists.
     """
     text = path.read_text()
-    made = {
-        value(x) for block in render.BLOCK.finditer(text) for x in re.findall(r"\d[\d,]*(?:\.\d+)?|\.\d+", block[0])
-    }
+    made = {value(x) for block in render.BLOCK.finditer(text) for x in re.findall(DIGITS, block[0])}
     made |= set(map(value, stated(path)))
     made |= set() if path.parent.name == "results" else set(map(float, range(11)))
-    found = numbers(render.BLOCK.sub("", text))
-    typed = [x for x in found if all(round(y, digits(x)) != value(x) for y in made)]
-    assert not typed, f"{typed}: make a block of them, or say in STATED why not"
+    return [
+        [x for x in numbers(section) if all(round(y, digits(x)) != value(x) for y in made)]
+        for section in sections(text)
+    ]
+
+
+def sections(text: str) -> list[str]:
+    return re.split(r"^## ", render.BLOCK.sub("", text), flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", TYPED, ids=page)
+def test_numbers_come_from_results(path: pathlib.Path):
+    found = sum(typed(path), [])
+    assert not found, f"{found}: make a block of them, or say in STATED what they are"
+
+
+@pytest.mark.parametrize("path", NOTES, ids=page)
+def test_notes_name_command_and_date(path: pathlib.Path):
+    """A section with numbers that no block has ends with `*Measured DATE: COMMAND ...*`."""
+    for found, section in zip(typed(path), sections(path.read_text()), strict=True):
+        assert not found or re.search(r"^\*Measured \d{4}-\d\d-\d\d[^*]+`[^*]+\*$", section, re.MULTILINE), section
 
 
 def test_what_is_stated_is_needed():
-    for path in TYPED:
+    for path in TYPED + NOTES:
         assert set(stated(path)) <= set(numbers(render.BLOCK.sub("", path.read_text()))), page(path)
-    assert STATED.keys() <= set(map(page, TYPED))
+    assert STATED.keys() <= set(map(page, TYPED + NOTES))
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"])
