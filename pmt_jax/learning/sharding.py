@@ -1,4 +1,4 @@
-"""How a run is split over devices: one mesh with the axes seed and env, and the functions that the learner uses it with.
+"""How a run is split over devices: one mesh with the axes seed and env, and what the learner calls to use it.
 
 Seeds exchange only metrics, so as many devices as possible share the seeds; the rest share each seed's environments.
 Environments step where they are (`apart`): physics engines are opaque to XLA's partitioner, which would hand every
