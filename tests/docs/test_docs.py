@@ -1,8 +1,4 @@
-"""Everything public is documented, and what the documentation shows runs.
-
-A Python block of a Markdown file that cannot run here (an hour, data of the reader's) stands below a comment that says
-why: `<!-- not run: REASON -->`. Such a block is still compiled.
-"""
+"""Everything public is documented, and what the documentation shows is right. `test_blocks.py` runs its blocks."""
 
 from __future__ import annotations
 
@@ -32,18 +28,13 @@ from pmt_jax.config.settings import FIELDS, load_config
 
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
-BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```python\n(.*?)```", re.DOTALL)
 # Examples that compile for several seconds; what they show is tested elsewhere too.
 SLOW = {"pmt_jax.learning.learner", "envs.voltage.control", "envs.voltage.baselines", "envs.voltage.power_flow"}
-# Pages whose examples train.
-TRAINING = {"evaluate", "own_loop", "own_method", "own_task"}
 
 
-def pages(what: str, slow: frozenset[str] | set[str] = frozenset()) -> list[Any]:
-    """The pages that have `what`; those of the stems in `slow` are tested in .ci/run's second part."""
-    found = [path for path in MARKDOWN if what in path.read_text()]
-    marks = {True: [pytest.mark.full], False: []}
-    return [pytest.param(x, id=str(x.relative_to(ROOT)), marks=marks[x.stem in slow]) for x in found]
+def pages(what: str) -> list[Any]:
+    """The pages that have `what`."""
+    return [pytest.param(x, id=str(x.relative_to(ROOT))) for x in MARKDOWN if what in x.read_text()]
 
 
 def commands(path: pathlib.Path, program: str = "pmt") -> list[list[str]]:
@@ -56,7 +47,7 @@ def commands(path: pathlib.Path, program: str = "pmt") -> list[list[str]]:
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
-    """Examples may write files and add methods; they find the repository's docs where a reader does."""
+    """Examples may write files and add methods; they find the repository's docs as a reader does."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     before = dict(METHODS)
@@ -111,20 +102,6 @@ def test_examples_in_docstrings(path: pathlib.Path):
     assert result.attempted and not result.failed
 
 
-@pytest.mark.parametrize("path", pages("```python", TRAINING))
-def test_python_in_markdown(path: pathlib.Path):
-    """A file's blocks run in order, in one namespace."""
-    text = path.read_text()
-    blocks = list(BLOCK.finditer(text))
-    assert len(blocks) == text.count("```python")
-    namespace: dict[str, object] = {}
-    for block in blocks:
-        line = text[: block.start(2)].count("\n")
-        program = compile("\n" * line + block[2], path, "exec")
-        if not block[1]:
-            exec(program, namespace)
-
-
 def test_the_citation_is_of_this_version():
     assert f"\nversion: {pmt_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'\nversion = "{pmt_jax.__version__}"\n' in (ROOT / "pyproject.toml").read_text()
@@ -171,14 +148,3 @@ def test_toml_in_markdown(path: pathlib.Path):
     for block in re.findall(r"```toml\n(.*?)```", path.read_text(), re.DOTALL):
         table = tomllib.loads(block)
         assert table.keys() - {"sweep", "extends", "env", "method"} <= FIELDS.keys()
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("page", ["install", "first_run"])
-def test_the_start_pages_run(page: str, cli: Any):
-    """Command after command, with fewer steps and episodes than the page has."""
-    ran = commands(ROOT / "docs" / "start" / f"{page}.md")
-    for words in ran:
-        short = re.sub(r"--steps \S+", "--steps 8192", re.sub(r"--episodes \S+", "--episodes 2", " ".join(words)))
-        assert cli(*short.split())[0] == 0, short
-    assert ran
