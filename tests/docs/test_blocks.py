@@ -28,10 +28,10 @@ from pmt_jax.studies import table
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```(bash|python|toml)\n(.*?)```", re.DOTALL)
-TRAINING = {"own_loop", "own_method"}  # pages without shell blocks whose Python trains
+SLOW = {"own_loop", "own_method", "voltage"}  # pages without shell blocks whose Python compiles for seconds
 
 ELSEWHERE = {
-    r"git clone|python -m venv|source|pip install": "downloads; .ci/run makes environments and installs into them",
+    r"git clone|cd|python -m venv|source|pip install": "downloads; .ci/run makes environments and installs into them",
     r"pytest": "the first part of .ci/run",
     r"srun|.*--coordinator": "several hosts; tests/training/test_devices.py has several processes",
     r"nvidia-": "an NVIDIA GPU",
@@ -51,6 +51,8 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"--(jobs|devices) \d+", r"--\1 1"),
     (r"sweep ant_2x4", "sweep lane"),
     (r"train voltage_33 --steps \S+", "train voltage_33 --steps 512"),
+    (r"--steps 0:150", "--steps 0:9"),
+    (r"--deterministic --size", "--deterministic --steps 0:9 --size"),
     (r"--method r4sg", "--method f4sg"),
     (r"train ant_2x4(.*) --eval-interval", r"train lane\1 --eval-interval"),
     (r"method=mappo_l,f4sg,r4sg", "method=f4sg"),
@@ -140,7 +142,7 @@ def folder(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
 def pages() -> list[Any]:
     found = [path for path in PAGES if BLOCK.search(path.read_text())]
-    late = [path for path in found if "```bash" in path.read_text() or path.stem in TRAINING]
+    late = [path for path in found if "```bash" in path.read_text() or path.stem in SLOW]
     name = {path: path.relative_to(ROOT).with_suffix("").as_posix() for path in found}
     return [pytest.param(path, id=name[path], marks=[pytest.mark.full] if path in late else []) for path in found]
 
