@@ -173,6 +173,7 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "epochs x minibatches": _sizes("epochs", "minibatches"),
     "networks; cost": _shown("{}", "networks"),
     "of pmt train, MAPPO-L": _shown("{:.2f}", _of_mappo_l),
+    "other work, CPUs": _shown("{:.1f}", "other_work_cpus"),
     "turns' reward": _turns("rewards"),
     "turns' cost": _turns("costs"),
     "": _contestant,
@@ -383,7 +384,14 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         ("peer",),
         (
             *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
-            *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost", "first update, s"),
+            *(
+                "environment steps/s",
+                "of pmt train, MAPPO-L",
+                "turns' reward",
+                "turns' cost",
+                "first update, s",
+                "other work, CPUs",
+            ),
         ),
     ),
 }
