@@ -148,6 +148,7 @@ def pages() -> list[Any]:
     return [pytest.param(path, id=name[path], marks=[pytest.mark.full] if path in late else []) for path in found]
 
 
+@pytest.mark.timeout(1800)  # a page has many commands, and a machine may be loaded
 @pytest.mark.parametrize("path", pages())
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")
 def test_blocks_run(path: pathlib.Path, folder: pathlib.Path, cli: Any):
