@@ -17,6 +17,7 @@ from pmt_jax.studies import plot, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import mean_interval, u_test
+from pmt_jax.tasks import columns
 
 from .. import records
 
@@ -55,15 +56,17 @@ def load(file: pathlib.Path) -> list[Run]:
 def _compact(log: RunLog) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
-    Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are their means over seeds [points]; `table`
-    is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean cost of all episodes while it trained.
+    Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
+    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean cost of all episodes while
+    it trained.
     """
     found, (row,) = log.thinned(plot.POINTS), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
     if "true_step_cost" in log.metrics:
         scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
     names = [name for name in (*CURVES, *TRUE_CURVES) if name in found.metrics]
-    diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(DIAGNOSTICS)}
+    kept = (*DIAGNOSTICS, *(f"info/{name}" for name in columns(found.task)))
+    diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(kept)}
     return {
         "steps": found.steps.tolist(),
         "seeds": list(found.seeds),
