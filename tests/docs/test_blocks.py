@@ -53,6 +53,7 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"sweep ant_2x4", "sweep lane"),
     (r"train voltage_33 --steps \S+", "train voltage_33 --steps 512"),
     (r"--steps 0:150", "--steps 0:9"),
+    (r"--steps 80:220:4", "--steps 80:88:4"),
     (r"--deterministic --size", "--deterministic --steps 0:9 --size"),
     (r"--method r4sg", "--method f4sg"),
     (r"train ant_2x4(.*) --eval-interval", r"train lane\1 --eval-interval"),

@@ -321,7 +321,7 @@ def test_baselines_order_as_they_should() -> None:
 
     def figures(name: str) -> dict[str, float]:
         policy = jax.vmap(POLICIES[name](env))
-        return {k: float(x.mean()) for k, x in jax.jit(lambda: play(env, lambda s, _: policy(s), 64))().items()}
+        return {k: float(x.mean()) for k, x in jax.jit(lambda: play(env, lambda s, _: policy(s), 16))().items()}
 
     found = {name: figures(name) for name in POLICIES}
     rate = {name: f["info/totally_controllable_ratio"] for name, f in found.items()}
