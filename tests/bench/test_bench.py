@@ -246,6 +246,7 @@ def test_every_result_is_used_by_a_page_or_a_test():
     elsewhere = {
         "ant_paths",
         "ant_paths_methods",
+        "episode_cost",
         "fear_map",
         "hand_over_catch",
         *curves.FIGURES.values(),
