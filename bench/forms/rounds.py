@@ -17,7 +17,20 @@ from pmt_jax.config.settings import Config
 from pmt_jax.studies.statistics import holm, probability_of_improvement, u_test
 
 from . import runs
-from .study import NAMES, Scores, baseline, difference, label, mean_sd, measures, p_value, settings, share, welch
+from .study import (
+    NAMES,
+    Scores,
+    baseline,
+    difference,
+    label,
+    mean_sd,
+    measures,
+    p_value,
+    settings,
+    share,
+    unsafe,
+    welch,
+)
 from .tables import markdown
 
 MEASURES = ("end", "training", "reward")
@@ -40,7 +53,7 @@ def as_second(file: pathlib.Path) -> str:
             less = "-" if base is None or base is run else difference(own, scores[cells.index(base)])
             line = [task, f"{share(run):g}", label(run, [x for x in cells if share(x) == share(run)])]
             line += [mean_sd(own["end"]), mean_sd(own["training"]), less, mean_sd(own["reward"])]
-            body.append([*line, _unsafe(run, own), p_value(corrected[i]) if i in corrected else "-"])
+            body.append([*line, unsafe(run, own), p_value(corrected[i]) if i in corrected else "-"])
     head = ["task", "p", "method", "true cost at the end", "true cost per 1,000 steps, training"]
     head += ["less MAPPO-L's [95 %]", "reward", "unsafe seeds", "corrected p, F4SG's cost at the end"]
     return markdown(head, body)
@@ -221,7 +234,7 @@ def beside(groups: Sequence[Sequence[runs.Run]]) -> str:
             p = ", ".join(p_value(x[pairs.index((i, j))]) for x in corrected) if j else "-"
             less = difference(own, scores[i][0]) if j else "-"
             line = [f"{share(run):g}", label(run, every), str(run["seeds"][0]), mean_sd(own["end"])]
-            body.append([*line, mean_sd(own["training"]), less, mean_sd(own["reward"]), _unsafe(run, own), p])
+            body.append([*line, mean_sd(own["training"]), less, mean_sd(own["reward"]), unsafe(run, own), p])
     head = ["p", "method", "seeds from", "true cost at the end", "true cost per 1,000 steps, training"]
     head += ["less the first row's [95 %]", "reward", "unsafe seeds", "corrected p: end, training, reward"]
     return markdown(head, body)
@@ -250,11 +263,6 @@ def _read(cells: Sequence[runs.Run], among: Sequence[runs.Run] = ()) -> list[dic
 
 def _environments(run: runs.Run) -> int:
     return settings(run).get("num_envs", Config.num_envs)
-
-
-def _unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
-    """How many seeds end beyond the limit."""
-    return f"{(own['end'] > run['cost_limit'] / share(run)).sum()} of {len(own['end'])}"
 
 
 FORMS: dict[str, Callable[[pathlib.Path], str]] = {

@@ -5,7 +5,9 @@ Those of the later rounds are in rounds.py.
 
 from __future__ import annotations
 
+import functools
 import pathlib
+import tomllib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -68,8 +70,13 @@ def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
 
 def settings(run: runs.Run) -> dict[str, Any]:
     """The run's settings; those that are newer than it have their defaults."""
-    stored = runs.curves(run).settings
+    stored = _config(run["config"])
     return {key: getattr(Config, key, "none") for key in SHOWN} | stored | (stored.get("env") or {})
+
+
+@functools.cache  # a table asks for the settings of a run many times
+def _config(text: str) -> dict[str, Any]:
+    return tomllib.loads(text)
 
 
 def as_study(file: pathlib.Path) -> str:
@@ -88,10 +95,9 @@ def as_study(file: pathlib.Path) -> str:
     body = []
     for i, (run, own) in enumerate(zip(found, scores, strict=True)):
         low, high = iqm_interval(own["end"])
-        limit = run["cost_limit"] / share(run)
         line = [f"{share(run):g}", label(run, [x for x in found if share(x) == share(run)])]
         line += [mean_sd(own["end"]), f"{iqm(own['end']):.1f} [{low:.1f}, {high:.1f}]", mean_sd(own["training"])]
-        line += [mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {len(own['end'])}"]
+        line += [mean_sd(own["reward"]), unsafe(run, own)]
         if i in fear:
             wins = probability_of_improvement([own["end"]], [scores[fear[i]]["end"]])
             line += [f"{wins:.2f}", ", ".join(p_value(p[place[i]]) for p in corrected.values())]
@@ -102,7 +108,12 @@ def as_study(file: pathlib.Path) -> str:
 
 
 def share(run: runs.Run) -> float:
-    return runs.curves(run).settings["cost_seen"]
+    return settings(run)["cost_seen"]
+
+
+def unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
+    """How many seeds end beyond the limit."""
+    return f"{(own['end'] > run['cost_limit'] / share(run)).sum()} of {len(own['end'])}"
 
 
 def _is_compared(run: runs.Run) -> bool:
@@ -124,7 +135,7 @@ def as_lag(file: pathlib.Path) -> str:
         run
         for name in ("study_ant_2x4_h200", "study_voltage_33_h200")
         for run in runs.load(records.RESULTS / f"{name}.json")
-        if run["method"] in ("mappo_l", "f4sg", "r4sg") and runs.curves(run).settings["lambda_init"] < 4
+        if run["method"] in ("mappo_l", "f4sg", "r4sg") and settings(run)["lambda_init"] < 4
     ]
     kept = {(run["task"], share(run)) for run in new}
     every = new + [run for run in old if (run["task"], share(run)) in kept]
@@ -184,14 +195,14 @@ def as_equivalence(file: pathlib.Path) -> str:
 def as_headline(file: pathlib.Path) -> str:
     """MAPPO-L beside F4SG at every p, with the multiplier that both share."""
     found = runs.load(file)
-    base = min(runs.curves(run).settings["lambda_init"] for run in found)
+    base = min(settings(run)["lambda_init"] for run in found)
     body = []
     for p in sorted({share(run) for run in found}, reverse=True):
-        same = [x for x in found if share(x) == p and runs.curves(x).settings["lambda_init"] == base]
+        same = [x for x in found if share(x) == p and settings(x)["lambda_init"] == base]
         pair = [(x, measures(x)) for name in ("mappo_l", "f4sg") for x in same if x["method"] == name]
-        unsafe = [f"{(own['end'] > x['cost_limit'] / p).sum()} of {len(own['end'])}" for x, own in pair]
+        beyond = [unsafe(x, own) for x, own in pair]
         ends, rewards = ([mean_sd(own[measure]) for _, own in pair] for measure in ("end", "reward"))
-        body.append([f"{p:g}", *(" / ".join(cell) for cell in (ends, rewards, unsafe))])
+        body.append([f"{p:g}", *(" / ".join(cell) for cell in (ends, rewards, beyond))])
     return markdown(["p", "true cost, MAPPO-L / F4SG", "reward", "seeds beyond the limit"], body)
 
 

@@ -54,13 +54,13 @@ def draw(found: list[runs.Run], file: pathlib.Path) -> None:
 
 def _line(axis: Any, cells: list[runs.Run], name: str) -> None:
     """One method's cells with its name; of MAPPO-Lagrangian those with another start of lambda by themselves."""
-    cells = sorted(cells, key=lambda run: -runs.curves(run).settings["cost_seen"])
+    cells = sorted(cells, key=lambda run: -study.share(run))
     method = cells[0]["method"]
     colour = METHOD_COLOURS[method]
-    usual = [run for run in cells if runs.curves(run).settings["lambda_init"] == 2]
+    usual = [run for run in cells if study.settings(run)["lambda_init"] == 2]
     aside = 1.05 ** (SHOWN.index(method) - 2)  # so that intervals do not hide each other
     for group, marker in ((usual, "o"), ([cell for cell in cells if cell not in usual], "s")):
-        shares = [runs.curves(run).settings["cost_seen"] * aside for run in group]
+        shares = [study.share(run) * aside for run in group]
         scores = [study.measures(run)[name] for run in group]
         middle = np.array([x.mean() for x in scores])
         ends = np.array([mean_interval(x) for x in scores]).reshape(-1, 2).T
@@ -78,7 +78,7 @@ def _line(axis: Any, cells: list[runs.Run], name: str) -> None:
         )
         for run, x, y in zip(group, shares, middle, strict=True):
             if marker == "s":
-                text = f"multiplier from {runs.curves(run).settings['lambda_init']:g}"
+                text = f"multiplier from {study.settings(run)['lambda_init']:g}"
                 axis.annotate(text, (x, y), (9, 0), textcoords="offset points", color=colour, va="center", fontsize=8)
             elif run is group[-1]:
                 *xytext, side = PLACES[name].get(method, (9, 0, "left"))
