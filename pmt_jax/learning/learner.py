@@ -192,7 +192,7 @@ def _episode_cost(setup: Setup, hyper: Hyper, state: LearnerState, batch: Batch,
 
 def _cost_excess(setup: Setup, hyper: Hyper, episode_cost: jax.Array) -> jax.Array:
     """How far an estimate [N, K] is beyond what the learner holds it to, in cost per step."""
-    held = jnp.asarray(hyper.cost_limit) * (1 - hyper.cost_margin)
+    held = lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin)
     return lagrangian.cost_excess(episode_cost, held, setup.vector.horizon)
 
 

@@ -162,7 +162,8 @@ def _update_multiplier(
     if setup.method.constraint == "none":
         return multiplier
     if setup.method.constraint == "trust_region":
-        return lagrangian.lowered_limit(multiplier, cost_excess, hyper.limit_lr, metrics["case"] == 0)
+        held = lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin) / setup.vector.horizon
+        return lagrangian.lowered_limit(multiplier, cost_excess, held, hyper.limit_lr, metrics["case"] == 0)
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
     excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)

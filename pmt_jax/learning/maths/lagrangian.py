@@ -15,6 +15,11 @@ def cost_excess(episode_cost: jax.Array, cost_limit: jax.Array | float, horizon:
     return (episode_cost - cost_limit) / horizon
 
 
+def held_limit(cost_limit: jax.Array | float, cost_margin: jax.Array | float) -> jax.Array:
+    """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
+    return jnp.asarray(cost_limit) * (1 - cost_margin)
+
+
 def in_limits(excess: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
     """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
 
@@ -50,18 +55,26 @@ def dual_update(
 
 
 def lowered_limit(
-    lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, helpless: jax.Array
+    lowered: jax.Array,
+    cost_excess: jax.Array,
+    held: jax.Array | float,
+    limit_lr: jax.Array | float,
+    helpless: jax.Array,
 ) -> jax.Array:
     """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
 
     A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where the
     step already does nothing but lower the cost, a limit lowered further would only have to be raised again later.
+    Nor is it lowered by more than the cost itself: what adds up while a policy is far beyond the limit would keep it in
+    recovery for good.
 
     Args:
-      lowered: [...] so far, and cost_excess: S [...], in cost per step; helpless: [] or [...] bool, the step was such.
+      lowered: [...] so far, cost_excess: S [...], and held: [...], the limit d, all in cost per step;
+        helpless: [] or [...] bool, the step did nothing but lower the cost.
     """
     step = limit_lr * cost_excess
-    return jnp.maximum(lowered + jnp.where(helpless, jnp.minimum(step, 0.0), step), 0.0)
+    lowered = lowered + jnp.where(helpless, jnp.minimum(step, 0.0), step)
+    return jnp.clip(lowered, 0.0, jnp.maximum(cost_excess + held, 0.0))
 
 
 def pid(
