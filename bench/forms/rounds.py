@@ -34,8 +34,12 @@ from .study import (
 from .tables import markdown
 
 MEASURES = ("end", "training", "reward")
-AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001}
-A, C = {"emotion_lr": 0.003}, {"emotion_lr": 0.01}  # the candidates of question b, both with `fear_start` nan
+AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001, "emotion_lr_start": 0.0}
+A, C, D = (
+    {"emotion_lr": 0.003},
+    {"emotion_lr": 0.01},
+    {"emotion_lr_start": 0.01},
+)  # question b, all with `fear_start` nan
 
 
 def as_second(file: pathlib.Path) -> str:
@@ -102,6 +106,27 @@ def as_candidate_half_life(file: pathlib.Path) -> str:
         text = f"{mean_sd(halving[name])}; {mean_sd(without[name])}; p {p_value(p)}"
         body.append(["4", f"MAPPO-L's {what} at the end, beside a constant learning rate's, p = 1", text, not worse])
     return _as_criteria(body, "with `lr_half_life` 2e5")
+
+
+def as_candidate_d(file: pathlib.Path) -> str:
+    """Question b in the fourth round: candidate D, fast in its first updates only, against the same criteria."""
+    found = runs.load(file)
+    body = _while_training(found, ("voltage_33", "hand_over_2x6"), D)
+    body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), D)
+    return _as_criteria(body, "candidate D")
+
+
+def as_fourth(file: pathlib.Path) -> str:
+    """Question b in the fourth round: its cells, those of one task and p beside MAPPO-L."""
+    found = [run for run in runs.load(file) if run["task"] != "ant_4x2"]
+    groups = dict.fromkeys((run["task"], share(run)) for run in found)
+    cells = [[run for run in found if (run["task"], share(run)) == group] for group in groups]
+    return beside([_first(same, method="mappo_l") for same in cells])
+
+
+def as_power(file: pathlib.Path) -> str:
+    """Question f: F4SG beside MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
+    return beside([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
 
 
 def _while_training(
@@ -223,7 +248,10 @@ def _prior_last(file: pathlib.Path) -> list[runs.Run]:
 
 
 def beside(groups: Sequence[Sequence[runs.Run]]) -> str:
-    """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure."""
+    """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure.
+
+    Groups of several tasks have a column for the task.
+    """
     scores = [_read(cells) for cells in groups]
     pairs = [(i, j) for i, cells in enumerate(groups) for j in range(1, len(cells))]
     corrected = [holm([u_test(scores[i][j][name], scores[i][0][name]) for i, j in pairs]) for name in MEASURES]
@@ -233,11 +261,13 @@ def beside(groups: Sequence[Sequence[runs.Run]]) -> str:
         for j, (run, own) in enumerate(zip(cells, scores[i], strict=True)):
             p = ", ".join(p_value(x[pairs.index((i, j))]) for x in corrected) if j else "-"
             less = difference(own, scores[i][0]) if j else "-"
-            line = [f"{share(run):g}", label(run, every), str(run["seeds"][0]), mean_sd(own["end"])]
+            name = label(run, [x for x in every if x["task"] == run["task"]])
+            line = [run["task"], f"{share(run):g}", name, str(run["seeds"][0]), mean_sd(own["end"])]
             body.append([*line, mean_sd(own["training"]), less, mean_sd(own["reward"]), unsafe(run, own), p])
-    head = ["p", "method", "seeds from", "true cost at the end", "true cost per 1,000 steps, training"]
+    head = ["task", "p", "method", "seeds from", "true cost at the end", "true cost per 1,000 steps, training"]
     head += ["less the first row's [95 %]", "reward", "unsafe seeds", "corrected p: end, training, reward"]
-    return markdown(head, body)
+    several = len({run["task"] for run in every}) > 1
+    return markdown(head, body) if several else markdown(head[1:], [line[1:] for line in body])
 
 
 def _second(file: pathlib.Path) -> list[runs.Run]:
@@ -276,6 +306,9 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "larger_batch": as_batch,
     "sway": as_sway,
     "responses": as_responses,
+    "candidate_d": as_candidate_d,
+    "fourth": as_fourth,
+    "power": as_power,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
 }

@@ -89,7 +89,9 @@ def _rounded(x: float, digits: int = 6) -> float | None:
 
 
 def curves(run: Run) -> RunLog:
-    """A stored run as `pmt plot` has it."""
+    """A stored run as `pmt plot` has it; each seed has the mean over seeds of what was stored as such."""
+    known = {name: np.array(run[name], float) for name in (*CURVES, *TRUE_CURVES) if name in run}
+    means = {name: np.array(mean, float) for name, mean in run.get("diagnostics", {}).items()}
     return RunLog(
         folder=pathlib.Path(run["task"]),
         task=run["task"],
@@ -98,7 +100,7 @@ def curves(run: Run) -> RunLog:
         settings=tomllib.loads(run["config"]),
         seeds=tuple(run["seeds"]),
         steps=np.array(run["steps"]),
-        metrics={name: np.array(run[name], float) for name in (*CURVES, *TRUE_CURVES) if name in run},
+        metrics=known | {name: np.tile(mean, (len(run["seeds"]), 1)) for name, mean in means.items()},
     )
 
 

@@ -26,7 +26,8 @@ Scores = NDArray[np.float64]  # [seeds]
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 SHOWN = {"lambda_init": "lambda from {}", "emotion_lr": "`emotion_lr` {}", "fear_start": "`fear_start` {}"}
 SHOWN |= {"regret_response": "`{}`", "lambda_kp": "`lambda_kp` {}", "lr_half_life": "`lr_half_life` {}"}
-SHOWN |= {name: f"`{name}` {{}}" for name in ("kappa", "surrogate_weight", "regret_max", "num_envs", "init_fear")}
+SHOWN |= {name: f"`{name}` {{}}" for name in ("emotion_lr_start", "kappa", "surrogate_weight", "regret_max")}
+SHOWN |= {name: f"`{name}` {{}}" for name in ("num_envs", "init_fear")}
 SHOWN |= {"sway": "the corridor moves, {}"}
 LAST = 0.1  # share of the steps that count as the end
 

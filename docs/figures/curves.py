@@ -1,4 +1,4 @@
-"""Draws docs/NAME.png, reward and cost over training of the runs in a file of bench/results.
+"""Draws docs/NAME.png, two curves over training of the runs in a file of bench/results: reward and cost, or CR and PL.
 
 python -m docs.figures.curves          all of them
 python -m docs.figures.curves table2   some
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,15 +32,21 @@ FIGURES = {
     "table3_voltage_141": "table3_voltage_141_h200",
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
+    "grid_33": "table3_voltage_33_h200",
+    "grid_141": "table3_voltage_141_h200",
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
+GRID_PANELS = {  # Fig. 3 of the paper
+    "info/totally_controllable_ratio": "CR, share of steps in the band",
+    "info/total_line_loss": "PL, power lost in lines (MW)",
+}
 
 
-def draw(shown: Sequence[Group], file: pathlib.Path) -> None:
+def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] = PANELS) -> None:
     """Two panels of one task: the mean over seeds with the method's name beside it, and the seeds' range in a band."""
     with rc_context(style.FONT):
         figure = Figure(figsize=(10, 4.2), layout="constrained")
-        for axis, (name, title) in zip(figure.subplots(1, 2), PANELS.items(), strict=True):
+        for axis, (name, title) in zip(figure.subplots(1, 2), panels.items(), strict=True):
             ends = [_line(axis, group, name, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
             axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
             axis.set_xlabel("environment steps of a seed")
@@ -75,7 +81,8 @@ def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     for name in names or FIGURES:
         found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
-        draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png")
+        panels = GRID_PANELS if name.startswith("grid") else PANELS
+        draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png", panels)
         print(f"docs/{name}.png")
 
 
