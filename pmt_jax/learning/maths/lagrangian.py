@@ -15,7 +15,7 @@ def cost_excess(episode_cost: jax.Array, cost_limit: jax.Array | float, horizon:
     return (episode_cost - cost_limit) / horizon
 
 
-def held_limit(cost_limit: jax.Array | float, cost_margin: jax.Array | float) -> jax.Array:
+def held_limit(cost_limit: jax.Array | float | tuple[float, ...], cost_margin: jax.Array | float) -> jax.Array:
     """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
     return jnp.asarray(cost_limit) * (1 - cost_margin)
 
