@@ -18,8 +18,12 @@ import pytest
 
 # Tests compile far longer than they run: with the least of optimisation programs compile in a quarter of the time.
 # Without fused multiply-adds, which XLA places as it happens to fuse, programs that compute the same agree bit for bit.
-# XLA ends a process that names a flag it does not know, and the first two come and go with its versions.
-_QUICK = {"0.9": "--xla_cpu_use_fusion_emitters=false", "0.12": "--xla_cpu_opt_preset=fast_compile"}
+# A program in one part compiles with less work than one in 32 parts, which are for idle cores.
+# XLA ends a process that names a flag it does not know, and those of _QUICK come and go with its versions.
+_QUICK = {
+    "0.9": "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+    "0.12": "--xla_cpu_opt_preset=fast_compile",
+}
 _MINOR = importlib.metadata.version("jaxlib").rpartition(".")[0]
 _NO_FMA = "--xla_cpu_max_isa=AVX" if platform.machine() in ("x86_64", "AMD64") else ""
 _FLAGS = ("--xla_backend_optimization_level=0", _QUICK.get(_MINOR, ""), _NO_FMA, os.environ.get("XLA_FLAGS", ""))

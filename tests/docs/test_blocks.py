@@ -62,6 +62,10 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"bench run.*", 'bench run ant --quick --only "plain loop"'),
     (r"HEAD~5", "bench/results"),  # a checkout may be shallow
     (r'load_config\("lane", method="f4sg"\)', 'load_config("lane", method="f4sg", steps=2000, num_envs=8)'),
+    # Programs that no other command shares are of the method that compiles fastest.
+    (r'load_config\("lane", (method="f4sg", )?(?!method)', 'load_config("lane", method="mappo", '),
+    (r"train (my_settings\.toml|voltage_33|ant_2x4(?= --env))", r"train \1 --method mappo"),
+    (r"train (docs/examples/my_env\.py) --method f4sg", r"train \1 --method mappo"),
     (r"random = \d+", "random = 2"),
     (r'"voltage_141"$', '"lane"'),
     (r"my/mapdn/folder", str(DATA / "mapdn_format_case33")),

@@ -24,12 +24,13 @@ SIBLINGS = {"ant_4x2", "voltage_141"}  # of tasks whose code is the same
 SIBLINGS |= {name for name in ALL if name.startswith("velocity_") and name != "velocity_hopper_3x1"}
 
 
-def each_task(*full: str):
+def each_task(*full: str, siblings: pytest.MarkDecorator = pytest.mark.full):
     """A test of every task; of siblings, and of those named, in the full suite alone."""
-    late = SIBLINGS | set(full)
-    return pytest.mark.parametrize(
-        "name", [pytest.param(name, marks=pytest.mark.full if name in late else ()) for name in ALL]
-    )
+    marks = dict.fromkeys(SIBLINGS, siblings) | dict.fromkeys(full, pytest.mark.full)
+    return pytest.mark.parametrize("name", [pytest.param(name, marks=marks.get(name, ())) for name in ALL])
+
+
+each_code = functools.partial(each_task, siblings=pytest.mark.slow)  # what a sibling's numbers cannot change
 
 
 @functools.cache
@@ -144,7 +145,7 @@ def test_restore_is_the_inverse_of_raw(name: str):
     chex.assert_trees_all_equal(raw_data(after), raw_data(expected))
 
 
-@each_task("hand_over_2x6", "voltage_33")
+@each_code("hand_over_2x6", "voltage_33")
 def test_same_numbers_jitted_or_not(name: str):
     env = made(name)
     state = jax.tree.map(lambda x: x[0], start(name))
@@ -155,7 +156,7 @@ def test_same_numbers_jitted_or_not(name: str):
     chex.assert_trees_all_close(raw_data(plain), raw_data(jitted), rtol=1e-5, atol=1e-5)
 
 
-@each_task()
+@each_code("voltage_33")
 def test_batches_nest(name: str):
     env = made(name)
     state = start(name)
@@ -166,7 +167,7 @@ def test_batches_nest(name: str):
     chex.assert_trees_all_close(raw_data(unnested), raw_data(flat), rtol=1e-5, atol=1e-5)
 
 
-@each_task("voltage_33")
+@each_code("voltage_33")
 def test_auto_reset_starts_anew_every_time(name: str):
     vector = VectorEnv(made(name), 2, horizon=2)
     step = jax.jit(vector.step)

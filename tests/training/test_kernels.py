@@ -65,7 +65,8 @@ def test_training_starts_without_warps_private_places(cli, tmp_path, monkeypatch
         raise AttributeError("no Module")
 
     monkeypatch.setattr(tasks, "kernels", missing)
-    arguments = [*ARGUMENTS[:-1], "--hidden", 7, "--no-cache"]  # nothing compiled before
+    quick = ("--method", "mappo", "--eval-interval", 0)
+    arguments = [*ARGUMENTS[:-1], *quick, "--hidden", 7, "--no-cache"]  # nothing compiled before
     code, text, _ = cli("train", *arguments, "--steps", 200, "--out", tmp_path / "run")
     assert code == 0 and "the first update compiles the physics' kernels: no Module" in text
 

@@ -53,5 +53,5 @@ def kill(unbroken: pathlib.Path, steps: int, disk: tuple[pathlib.Path, bool], ti
 @pytest.mark.parametrize(
     "seed", [pytest.param(i, marks=pytest.mark.slow if i else pytest.mark.full) for i in range(20)]
 )
-def test_killed_ten_times(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
-    kill(unbroken, LONG, disk, times=10, seed=seed)
+def test_killed_in_every_way(unbroken: pathlib.Path, disk: tuple[pathlib.Path, bool], seed: int):
+    kill(unbroken, LONG, disk, times=10 if seed else len(soak.KINDS), seed=seed)

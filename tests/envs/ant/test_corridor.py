@@ -37,7 +37,7 @@ def stepper(physics: str):
 
 
 def restored(env, rows):
-    return jax.vmap(env.restore)(rows["qpos0"], rows["qvel0"], rows["warm0"], rows["torso_xpos0"])
+    return jax.jit(jax.vmap(env.restore))(rows["qpos0"], rows["qvel0"], rows["warm0"], rows["torso_xpos0"])
 
 
 def inside_wall(rows) -> np.ndarray:
@@ -354,9 +354,10 @@ def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
 def test_mjx_feels_solid_walls_as_c_does():
     env, step = walled("solid", "mjx")
     states = flight("solid")[:16]
+    restore = jax.jit(lambda state: jax.vmap(env.restore)(**jax.vmap(env.raw)(state)))
     errors, touched = [], []
     for before, after, free in zip(states, states[1:], flight("costly")[1:], strict=False):
-        ours = step(jax.vmap(env.restore)(**jax.vmap(env.raw)(before)), jnp.zeros((len(before.reward), 2, 4)))
+        ours = step(restore(before), jnp.zeros((len(before.reward), 2, 4)))
         errors.append(np.abs(ours.carry.physics.qpos - after.carry.physics.qpos).max(axis=1))
         touched.append(np.abs(after.carry.physics.qpos - free.carry.physics.qpos).max(axis=1) > 1e-3)
     errors, touched = np.concatenate(errors), np.concatenate(touched)

@@ -77,6 +77,11 @@ def folder_env(**options):
     return envs.make("voltage_33", data=FOLDER, **{"noise": False, **options})
 
 
+@functools.cache
+def stepper(env):
+    return jax.jit(env.step)
+
+
 def first(env, **raw):
     return jax.jit(env.restore)(**{"start_row": 603, "q": np.zeros(env.spec.num_agents), **raw})
 
@@ -127,7 +132,7 @@ def test_rows_come_as_in_mapdn_or_one_a_step() -> None:
     knots = folder_env().profiles.p_load
 
     def used(env) -> list[int]:
-        state, rows, step = first(env), [], jax.jit(env.step)
+        state, rows, step = first(env), [], stepper(env)
         for _ in range(4):
             rows.append(int(np.abs(knots[:, :4] - np.asarray(state.carry.row[6:10])).sum(axis=1).argmin()) - 603)
             state = step(state, jnp.zeros((6, 1)))
@@ -141,7 +146,7 @@ def test_rows_come_as_in_mapdn_or_one_a_step() -> None:
 def test_actions_are_clipped_and_scaled() -> None:
     env = folder_env()
     state = first(env)
-    step = jax.jit(env.step)
+    step = stepper(env)
     far, edge = (step(state, jnp.full((6, 1), a)) for a in (7.0, 1.0))
     np.testing.assert_array_equal(far.carry.q, edge.carry.q)
     np.testing.assert_allclose(edge.carry.q, 0.8 * np.sqrt(env.s_max**2 - state.carry.row[:6] ** 2), rtol=1e-6)
@@ -164,8 +169,8 @@ def test_a_flow_without_solution_ends_the_episode_in_the_state_before() -> None:
     env = folder_env()
     state = first(env)
     heavy = dict(env.raw(state)) | {"row": state.carry.row.at[6:38].multiply(60.0)}
-    before = env.restore(**heavy)
-    after = jax.jit(env.step)(before, jnp.full((6, 1), 0.5))
+    before = first(env, **heavy)
+    after = stepper(env)(before, jnp.full((6, 1), 0.5))
     assert after.terminated and (after.cost == 1).all()
     np.testing.assert_array_equal(after.carry.vm_pu, before.carry.vm_pu)
     np.testing.assert_array_equal(after.carry.q, before.carry.q)
@@ -222,7 +227,7 @@ def test_costs() -> None:
 def test_reward_options_and_blocks() -> None:
     state = first(folder_env())
     step = jnp.full((6, 1), 0.4)
-    full = jax.jit(folder_env().step)(state, step)
+    full = stepper(folder_env())(state, step)
     effort = 0.1 * np.abs(np.asarray(full.carry.q)).mean()
     assert float(folder_env(reward="loss_only")._get_reward(full.carry)) == pytest.approx(-effort, rel=1e-5)
     lines = float(folder_env(reward="loss_only", line_weight=2.0)._get_reward(full.carry))
@@ -319,11 +324,13 @@ def test_baselines_order_as_they_should() -> None:
 
     env = envs.make("voltage_33", episode_limit=11)
 
-    def figures(name: str) -> dict[str, float]:
-        policy = jax.vmap(POLICIES[name](env))
-        return {k: float(x.mean()) for k, x in jax.jit(lambda: play(env, lambda s, _: policy(s), 16))().items()}
+    policies = [jax.vmap(make(env)) for make in POLICIES.values()]
 
-    found = {name: figures(name) for name in POLICIES}
+    @jax.jit  # the environment compiles once for all policies
+    def figures(number: int) -> dict[str, jax.Array]:
+        return {k: x.mean() for k, x in play(env, lambda s, _: jax.lax.switch(number, policies, s), 16).items()}
+
+    found = {name: figures(number) for number, name in enumerate(POLICIES)}
     rate = {name: f["info/totally_controllable_ratio"] for name, f in found.items()}
     loss = {name: f["info/total_line_loss"] for name, f in found.items()}
     assert rate["random"] < rate["zero"] < rate["droop"] <= rate["opf"]
