@@ -31,7 +31,7 @@ say = functools.partial(print, flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit code: 2 for a user's mistake, 1 where a bench failed or a table is old."""
+    """Runs one command; returns its exit code: 2 for a user's mistake, 1 if a bench failed or a table is old."""
     return answer("bench", lambda: _run(sys.argv[1:] if argv is None else list(argv)))
 
 
@@ -70,11 +70,11 @@ def _add_showing(commands: Any) -> None:
     compared.add_argument("old", help="a JSON file, a folder of them, or a git revision")
     compared.add_argument("new", help="the same")
     rendered = command(commands, "render", _render, "make the tables of README.md and docs/ from bench/results")
-    rendered.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a table is old")
+    rendered.add_argument("--check", action="store_true", help="write nothing; exit code 1 if a table is old")
     stored = command(commands, "store", _store, "training runs as a result")
     stored.add_argument("folders", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
-    published = command(commands, "publish", _publish, "make pretrained policies of runs, and tell their figures")
+    published = command(commands, "publish", _publish, "make pretrained policies of runs, and report their metrics")
     published.add_argument(
         "folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders, or hub:NAME to measure it anew"
     )

@@ -16,18 +16,18 @@ Settings = tuple[tuple[str, Any], ...]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One thing to measure. What is left out stands in no row.
+    """One thing to measure. A field that is left out is in no row.
 
     Attributes:
       kind: a plain Python loop over C MuJoCo; the environment alone under random actions; the whole training loop;
         the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned.
       task: an environment, or a network for power flows.
       what: which start, tool, policy or walls.
-      method, physics, solver: of training and of the engine; the task's own where left out.
+      method, physics, solver: of training and of the engine; the task's own if left out.
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
-      processes: that share the seeds of a training and the CPUs, without a word between them.
+      processes: that share the seeds of a training and the CPUs and do not communicate.
       settings: other settings of the training; alone, other options of the environment.
     """
 
@@ -77,8 +77,8 @@ class Bench:
     Attributes:
       what: what is measured, with units.
       cases: in the order of the rows; quick: what a smoke runs instead, once.
-      on: `gpu` and `gpus` are skipped where there is none, or only one, unless asked for by name; their results are
-        called after the device, too.
+      on: `gpu` and `gpus` are skipped if there is none, or only one, unless given by name; their results are
+        named after the device, too.
       by_turns: all programs are compiled first and take turns, so that other work on the machine hits all alike.
     """
 
@@ -90,7 +90,7 @@ class Bench:
 
 
 def _alone(task: str, sizes: Iterable[int], steps: int = 0, seeds: int = 1, **engine: Any) -> tuple[Case, ...]:
-    """The environment alone; a call has 2,048 steps of all environments together unless it is told."""
+    """The environment alone; a call has 2,048 steps of all environments together unless `steps` is given."""
     return tuple(
         Case("environment", task, seeds=seeds, num_envs=n, rollout_length=steps or max(4, 2048 // n), **engine)
         for n in sizes
@@ -278,7 +278,7 @@ BENCHES = {
 
 
 def chosen(names: Sequence[str]) -> list[str]:
-    """The benches by these names, in the order of BENCHES; all where there is no name.
+    """The benches by these names, in the order of BENCHES; all if there is no name.
 
     Raises:
       UsageError: there is none by that name.

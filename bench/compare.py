@@ -19,7 +19,7 @@ WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 
 
 class Change(NamedTuple):
-    """A figure then and now; `ratio` is above 1 where it became better, whichever way that is."""
+    """A figure then and now; `ratio` is above 1 if it became better, whichever way that is."""
 
     figure: str
     old: float

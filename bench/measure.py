@@ -49,7 +49,7 @@ Failures = dict[Case, str]
 
 
 def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
-    """Measures cases; where one fails, its row says why."""
+    """Measures cases; if one fails, its row says why."""
     found, failed = {}, Failures()
     for case in [case for case in cases if case.kind in ONCE]:
         await_quiet(6 * effort.patience if case.kind == "start" else 0)
@@ -71,7 +71,7 @@ def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[st
 
 
 def _attempt(failed: Failures, case: Case, work: Callable[[], Any]) -> Any:
-    """What `work` gives; an engine that is missing, or a device without the memory, is a result too."""
+    """What `work` returns; an engine that is missing, or a device without the memory, is a result too."""
     try:
         return work()
     except Exception as error:
@@ -102,7 +102,7 @@ def _compiled(
 
 
 def environment(case: Case) -> Build:
-    """jit(scan(vmap(step))) with random actions, and with resets where an episode terminates."""
+    """jit(scan(vmap(step))) with random actions, and with resets if an episode terminates."""
     named = {"physics": case.physics, "solver": case.solver}
     env = envs.make(case.task, **{name: word for name, word in named.items() if word}, **dict(case.settings))
     shape = (case.seeds, case.num_envs)

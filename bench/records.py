@@ -87,7 +87,7 @@ def _reports(texts: Iterable[tuple[str, str]]) -> dict[str, Report]:
 
 
 def git(*words: str) -> str | None:
-    """What git says in this folder; None where it fails or is missing."""
+    """What git says in this folder; None if it fails or is missing."""
     try:
         done = subprocess.run(["git", *words], cwd=RESULTS.parent, capture_output=True, text=True, check=False)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Runs benches, each in a process of its own: memory, compiling and JAX's settings are nobody else's."""
+"""Runs benches, each in a process of its own, so that memory, compiling and JAX's settings belong to that bench."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _missing(bench: Bench, count: int, device: str) -> str | None:
 
 
 def devices() -> tuple[int, str]:
-    """How many devices JAX sees and their kind, asked in another process, since whoever asks takes their memory."""
+    """How many devices JAX sees and their kind, asked in another process, because asking takes their memory."""
     asked = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=False)
     if asked.returncode:
         raise UsageError(f"JAX does not start here: {asked.stderr.strip().splitlines()[-1]}")

@@ -97,7 +97,7 @@ def task_options(name: str) -> dict[str, Any]:
 
 
 def explain_options(name: str) -> str:
-    """The arguments in a task's docstring; '' where it has none.
+    """The arguments in a task's docstring; '' if it has none.
 
     Raises:
       TaskError: unknown name.

@@ -1,7 +1,7 @@
 """The environment contract: one State in, one State out.
 
-An environment is a value with a `spec`, the name of its `engine`, and two pure functions, `reset` and `step`. It never
-resets itself and has no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
+An environment is a value with a `spec`, the name of its `engine`, and two pure functions, `reset` and `step`. It does
+not reset itself and has no horizon: `envs.vector` does batching, time limits, auto-reset and broken physics for all.
 
 Examples:
   >>> import jax, envs
@@ -111,7 +111,7 @@ class Env(Protocol):
     """
 
     spec: EnvSpec
-    engine: str  # the physics engine behind it, 'xla' where the task is plain JAX
+    engine: str  # the physics engine behind it, 'xla' if the task is plain JAX
 
     def reset(self, key: jax.Array) -> State:
         """The start of an episode drawn with `key`."""
@@ -141,7 +141,7 @@ class Scene:
     """MuJoCo bodies.
 
     Attributes:
-      raw: its `qpos` poses the bodies; those that follow no joint move by `mocap_pos` and `mocap_quat`, where it has
+      raw: its `qpos` poses the bodies; those that follow no joint move by `mocap_pos` and `mocap_quat`, if it has
         them.
       model: the mujoco.MjModel that is drawn; its first camera, if any, is the view.
       decorate: `decorate(scene, raw, cost)` changes a mujoco.MjvScene of `model` before it is drawn, by colours or by
@@ -190,7 +190,7 @@ class Declarations:
       actions: for each agent the names of its action entries, without padding.
       picture: how an episode is drawn.
       baselines: name -> a function that makes a policy which needs no training.
-      overflow: the name in `info` that is above 0 where the physics lost contacts, which makes a step wrong.
+      overflow: the name in `info` that is above 0 if the physics lost contacts, which makes a step wrong.
     """
 
     observation: Blocks = ()
@@ -202,5 +202,5 @@ class Declarations:
 
 
 def declarations(env: Env) -> Declarations:
-    """What `env` declares; the defaults where it has no `declares`."""
+    """What `env` declares; the defaults if it has no `declares`."""
     return getattr(env, "declares", Declarations())

@@ -14,7 +14,7 @@ class Block(NamedTuple):
     """Consecutive entries of one kind.
 
     Attributes:
-      name: of the block; size: its entries; unit: of each, '-' where it has none.
+      name: of the block; size: its entries; unit: of each, '-' if it has none.
       meaning: the rest of a sentence that begins with the name.
     """
 

@@ -18,7 +18,7 @@ class TaskError(ValueError):
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """The nearest of `choices` as '; did you mean ...?', or the whole list where none is near."""
+    """The nearest of `choices` as '; did you mean ...?', or the whole list if none is near."""
     choices = list(choices)
     near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(choices) or 'none'}"

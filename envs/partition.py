@@ -43,7 +43,7 @@ class Partition(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For the names of tasks: `2x4` where it is even, else the sizes, as `6_2`."""
+        """For the names of tasks: `2x4` if it is even, else the sizes, as `6_2`."""
         sizes = [len(group) for group in self.groups]
         return f"{len(sizes)}x{sizes[0]}" if self.even else "_".join(map(str, sizes))
 

@@ -1,4 +1,4 @@
-"""Three constrained tasks small enough for their optimum to be known: the learner's proving ground.
+"""Three constrained tasks small enough for their optimum to be known, for tests of the learner.
 
 Agents (two of them) with two actions each share reward and cost; an episode has 25 steps and never terminates.
 
@@ -147,7 +147,7 @@ class Switch(Lane):
 
 
 class Noisy(Lane):
-    """`lane` whose danger strikes only three times in ten: the cost signal is mostly noise, fear should not be."""
+    """`lane` whose danger costs with probability 0.3: the cost signal is mostly noise, fear should not be."""
 
     name = "noisy"
     cost_limit = 0.5

@@ -1,6 +1,6 @@
 """A task of the user's own: a Python file that keeps the contract of `envs.base`.
 
-Its name is `my_env.py`, or `my_env.py:Name` where the file holds more than one class or function. Importing this module
+Its name is `my_env.py`, or `my_env.py:Name` if the file holds more than one class or function. Importing this module
 imports neither JAX nor MuJoCo.
 """
 
@@ -149,7 +149,7 @@ def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
 
 
 def _check_values(env: Env, name: str) -> None:
-    """Plays a reset and two steps, without any action and with the largest in [-1, 1], and looks at their numbers."""
+    """Plays a reset and two steps, without any action and with the largest in [-1, 1], and checks their numbers."""
     import jax
     import jax.numpy as jnp
     import numpy as np

@@ -57,7 +57,7 @@ class VectorEnv:
 
     Args:
       env: the environment; num_envs: B.
-      horizon: control steps of an episode; the task's own where None.
+      horizon: control steps of an episode; the task's own if None.
       limit_terminates: an episode that reaches the horizon counts as terminated, as it does in SafePO and others of its
         family, so that nothing bootstraps from what comes after.
 

@@ -58,17 +58,17 @@ def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def replace_text(path: pathlib.Path, text: str) -> None:
-    """Writes a file whole or, where that fails, leaves the old one."""
+    """Writes a file whole or, if that fails, leaves the old one."""
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text)
     partial.replace(path)
 
 
 def read_rows(metrics: pathlib.Path, missing_ok: bool = True) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl; a line that is not one, as where a write was cut off, is left out.
+    """The rows of a metrics.jsonl; a line that is not one, such as the end of a write that was cut off, is left out.
 
     Raises:
-      OSError: it cannot be read; where there is no file and `missing_ok`, there are no rows.
+      OSError: it cannot be read; if there is no file and `missing_ok`, there are no rows.
     """
     rows = []
     for line in [] if missing_ok and not metrics.exists() else metrics.read_text(errors="replace").splitlines():

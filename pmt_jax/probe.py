@@ -8,7 +8,7 @@ import sys
 
 
 def run_python(code: str, **environment: str) -> str | None:
-    """Runs Python code in a process of its own; the last line of its error, None where it had none."""
+    """Runs Python code in a process of its own; the last line of its error, None if it had none."""
     command = [sys.executable, "-c", code]
     try:
         done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=60)

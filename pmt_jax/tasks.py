@@ -1,4 +1,4 @@
-"""The door to the environments: the only file of pmt_jax that imports `envs`, and only when asked."""
+"""Access to the environments: the only file of pmt_jax that imports `envs`, on first use."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def absolute(name: str) -> str:
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """The nearest of `choices` as '; did you mean ...?', or all of them where none is near."""
+    """The nearest of `choices` as '; did you mean ...?', or all of them if none is near."""
     return _envs().errors.did_you_mean(word, choices)
 
 
@@ -113,7 +113,7 @@ def installed_version(package: str) -> str | None:
 
 
 def engines() -> tuple[str, dict[str, str | None]]:
-    """The physics engine that `auto` takes here, and for each engine why it cannot run here, None where it can.
+    """The physics engine that `auto` takes here, and for each engine why it cannot run here, None if it can.
 
     Raises:
       UsageError: MuJoCo is missing or of another version.
@@ -128,7 +128,7 @@ def engines() -> tuple[str, dict[str, str | None]]:
 
 
 def make(name: str, physics: str = "auto", **options: Any) -> Env:
-    """Builds a task, with the engine asked for where it has one.
+    """Builds a task, with the chosen engine if it has one.
 
     Raises:
       UsageError: unknown task or option, an engine that cannot run here, or a file that does not keep the contract.

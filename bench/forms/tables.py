@@ -1,6 +1,6 @@
 """What pages show of bench/results: each table is a pure function from results by name to Markdown.
 
-A row of a result holds what was measured; figures that relate it to other rows are made here, turn by turn where both
+A row of a result holds what was measured; figures that relate it to other rows are made here, turn by turn if both
 have the rates of as many turns, else of the medians.
 """
 
@@ -58,7 +58,7 @@ def ratios(row: Row, other: Row) -> list[float]:
 
 
 def _over(row: Row, rows: Rows, **reference: Any) -> float | None:
-    """The median ratio to the row that is like this one but for `reference`; None where there is no such row."""
+    """The median ratio to the row that is like this one but for `reference`; None if there is no such row."""
     found = [other for other in matching(rows, **reference) if rate(other)]
     return statistics.median(ratios(row, found[0])) if found and rate(row) else None
 
@@ -121,7 +121,7 @@ def _ours(row: Row, rows: Rows) -> list[float]:
 
 
 def _shown(form: str, found: Figure | str) -> Callable[[Row, Rows], str]:
-    """A column: a figure (or what stands in the row under that name) in some format, `-` where there is none."""
+    """A column: a figure (or what stands in the row under that name) in some format, `-` if there is none."""
 
     def cell(row: Row, rows: Rows) -> str:
         value = row.get(found) if isinstance(found, str) else found(row, rows)
@@ -286,7 +286,7 @@ def beside(reports: Reports) -> str:
 
 
 def limits(reports: Reports) -> str:
-    """Training beside its environment alone, where both were measured at the same size."""
+    """Training beside its environment alone, if both were measured at the same size."""
     ant, engines, loop, scaling = (
         reports[name]["rows"] for name in ("ant", "engines_h200", "loop_h200", "scaling_h200")
     )

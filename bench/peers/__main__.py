@@ -14,7 +14,7 @@ from .learners import TASK, Arguments, Report
 
 
 def main() -> None:
-    """Trains until its time is up; a last line says why where it cannot."""
+    """Trains until its time is up; a last line says why if it cannot."""
     parser = argparse.ArgumentParser()
     parser.add_argument("name", choices=PEERS)
     parser.add_argument("--out", type=pathlib.Path, required=True)

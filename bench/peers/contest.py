@@ -61,7 +61,7 @@ PEERS = {
 
 
 def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say: Callable[[str], None]) -> int:
-    """Runs all peers by turns and writes the result; 0 where at least ours have run.
+    """Runs all peers by turns and writes the result; 0 if at least ours have run.
 
     Args:
       out: a JSON file; None for bench/results/peers.json (on a GPU with its name), with `quick` for a new folder.
@@ -79,7 +79,7 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
     turns: dict[str, list[Row]] = {name: [] for name in PEERS}
     cache = tempfile.TemporaryDirectory()  # of compiled programs, empty in the first turn
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache.name
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # who only names the device takes no memory
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # naming the device then takes no memory
     for turn in range(effort.turns):
         for name, peer in PEERS.items():
             if turns[name] and "failed" in turns[name][-1]:

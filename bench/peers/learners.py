@@ -45,7 +45,7 @@ class Report:
         self._out.write(json.dumps(facts) + "\n")
 
     def __call__(self, steps: int, reward: Any = None, cost: Any = None) -> None:
-        """`steps` so far, over all environments; reward and cost of recent episodes, NaN or None where none ended."""
+        """`steps` so far, over all environments; reward and cost of recent episodes, NaN or None if none ended."""
         self._watch = self._watch or measure.Watch()
         scores = {name: float(x) for name, x in (("reward", reward), ("cost", cost)) if x is not None}
         known = {name: x for name, x in scores.items() if math.isfinite(x)}

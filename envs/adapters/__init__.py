@@ -1,7 +1,7 @@
 """Tasks as environments of other libraries (gymnasium, PettingZoo, brax, JaxMARL), and brax environments as tasks.
 
-The library is imported when its adapter is first asked for (`pip install "pmt-jax[adapters]"` brings the first three;
-`to_jaxmarl` and `from_brax` import none).
+An adapter imports its library on first use (`pip install "pmt-jax[adapters]"` installs the first three).
+`to_jaxmarl` and `from_brax` import none.
 
 Examples:
   >>> import envs
@@ -38,10 +38,10 @@ def to_gymnasium(env: Env, num_envs: int, seed: int = 0) -> GymnasiumVector:
     """`num_envs` copies of `env` as a `gymnasium.vector.VectorEnv` that resets in the same step.
 
     Observations are [num_envs, N, O] and actions [num_envs, N, A] in [-1, 1]; the reward is the team's. `info` holds
-    `cost` [num_envs, N, K], `global_state` [num_envs, S], the task's scalars, and `final_obs` where an episode ended.
+    `cost` [num_envs, N, K], `global_state` [num_envs, S], the task's scalars, and `final_obs` if an episode ended.
 
     Args:
-      seed: of the first episodes where `reset` names none.
+      seed: of the first episodes if `reset` names none.
 
     Raises:
       TaskError: gymnasium is not installed.
@@ -55,7 +55,7 @@ def to_pettingzoo(env: Env, seed: int = 0) -> PettingZooParallel:
     Every agent gets the team's reward; its costs [K] are in `infos[agent]["cost"]`; `state()` is the global state.
 
     Args:
-      seed: of the first episode where `reset` names none.
+      seed: of the first episode if `reset` names none.
 
     Raises:
       TaskError: PettingZoo is not installed.
@@ -81,7 +81,7 @@ def to_jaxmarl(env: Env) -> JaxMarlEnv:
 
     Every agent gets the team's reward. `infos` holds arrays [N]: `cost` (an agent's own, summed over K; of several also
     `cost/0` ...), `truncated`, and the task's own scalars. An episode ends for all agents, by the task's rule or its
-    time limit, and the next begins in the same step, as in JaxMARL. It is no subclass: JaxMARL's trainers and
+    time limit, and the next begins in the same step, as in JaxMARL. It is not a subclass: JaxMARL's trainers and
     `LogWrapper` need none.
 
     Example:
@@ -112,11 +112,11 @@ def from_brax(
       env: without wrappers: time limits, auto-reset and batches are `envs.vector`'s.
       cost: the metric; clipped to [0, 1], and the same for every agent.
       cost_limit: allowed sum of costs over an episode.
-      above: where given, the cost is 1 while the metric is above it, else 0.
+      above: if given, the cost is 1 while the metric is above it, else 0.
       horizon: control steps of an episode.
-      partition: the actuators of each agent, as `0,1|2,3` or lists; one agent where empty. Every agent sees the whole
-        observation, and of several also its own one-hot index.
-      name: of the task; the class's where empty.
+      partition: the actuators of each agent, as `0,1|2,3` or lists; one agent if empty. Every agent sees the whole
+        observation; each of several agents also sees its own one-hot index.
+      name: of the task; the class's if empty.
 
     Raises:
       TaskError: no such metric, or a partition that leaves an actuator out.

@@ -76,10 +76,10 @@ class JaxMarlEnv:
     def step(
         self, key: jax.Array, state: VectorState, actions: ByAgent, reset_state: VectorState | None = None
     ) -> tuple[ByAgent, VectorState, ByAgent, ByAgent, ByAgent]:
-        """One control step; where an episode ends, a new one begins, drawn with the state's own key or `reset_state`.
+        """One control step; if an episode ends, a new one begins, drawn with the state's own key or `reset_state`.
 
         Returns:
-          observations (of the new episode, where one begins), state, rewards, dones with `__all__`, and infos.
+          observations (of the new episode, if one begins), state, rewards, dones with `__all__`, and infos.
         """
         del key
         joint = jnp.zeros((1, *self._vector.spec.action_mask.shape))

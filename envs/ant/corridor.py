@@ -92,7 +92,7 @@ class AntCorridor:
       sway: `none`, or the corridor moves along y by 1 m x sin(phase), a period in 10 s from a random phase: danger that
         is not where it was. `seen`: observations measure the place from where the centre line is now, and hold its
         velocity. `hidden`: they measure it from where the line is on average.
-      threads: of the `mujoco` engine; all usable CPUs where None.
+      threads: of the `mujoco` engine; all usable CPUs if None.
     """
 
     @typed
@@ -190,9 +190,9 @@ class AntCorridor:
         Args:
           qpos: [15] position, quaternion (w first; normalised if it is not), joint angles.
           qvel: [14] velocities.
-          warmstart: [14] `qacc_warmstart`; zero where None.
-          torso_xpos: [3] where the last control step left the torso's `xpos`; qpos[:3] where None.
-          phase: [] rad, of a corridor that sways; 0 where None.
+          warmstart: [14] `qacc_warmstart`; zero if None.
+          torso_xpos: [3] where the last control step left the torso's `xpos`; qpos[:3] if None.
+          phase: [] rad, of a corridor that sways; 0 if None.
         """
         start = self._engine.start()
         dtype = start.qpos.dtype
@@ -252,7 +252,7 @@ class AntCorridor:
     def _get_obs(self, physics: PhysicsState, phase: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         """Observations [N, 29 + N] and the raw state [29] they all contain; agents differ in the one-hot index only.
 
-        Where a sway is seen, both have an entry more.
+        If a sway is seen, both have one more entry.
         """
         qpos, qvel = physics.qpos, physics.qvel
         shown = phase if self.sway == "seen" else None

@@ -27,7 +27,7 @@ REACH = 600.0  # m along x from the start, either way: further than an ant runs 
 THICKNESS, HEIGHT = 1.0, 1.4  # m, of a solid wall; thick enough that no step ends behind it
 COSTLY_REACH = 20.0  # m, how far the floor behind a costly wall is drawn as costly
 _TOUCHING = 2  # the bit of `contype` and `conaffinity` for contacts with solid walls
-_MOST_CONTACTS = 32  # of an ant with solid walls; MJX, which knows no broad phase, would solve for all 97
+_MOST_CONTACTS = 32  # of an ant with solid walls; MJX has no broad phase and would solve for all 97
 _PIECES = tuple(itertools.product((1, -1), range(len(SLOPES))))  # side (1 is left), segment
 
 

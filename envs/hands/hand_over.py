@@ -169,7 +169,7 @@ class HandOver:
       full_hand: adds the 20 contacts inside each hand (fingers, thumb, palm) and the dry friction of its joints.
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
-      threads: of the `mujoco` engine; all usable CPUs where None.
+      threads: of the `mujoco` engine; all usable CPUs if None.
     """
 
     @typed
@@ -272,7 +272,7 @@ class HandOver:
           qvel: [54] joint velocities, the object's velocity (world frame) and spin (its own frame).
           goal_quat: [4] w first.
           last_action: [40].
-          warmstart: [54] `qacc_warmstart`; joint_force: [48], touch: [2, 5, 6], see `Carry`. Zero where None.
+          warmstart: [54] `qacc_warmstart`; joint_force: [48], touch: [2, 5, 6], see `Carry`. Zero if None.
         """
         start = self._engine.start()
         array = functools.partial(jnp.asarray, dtype=start.qpos.dtype)
@@ -293,7 +293,7 @@ class HandOver:
         return {**vars(carry.physics), **rest}
 
     def decorate(self, scene: mujoco.MjvScene, raw: Mapping[str, np.ndarray], cost: float) -> None:
-        """Adds the ghost of the goal to a scene made from `raw`, and reddens the index finger of hand 0 where it costs.
+        """Adds the ghost of the goal to a scene made from `raw`, and reddens the index finger of hand 0 if it costs.
 
         Args:
           scene: already updated from an mjData of `model`.
@@ -448,7 +448,7 @@ def _isaac_frame(frame: jax.Array) -> jax.Array:
 class _Links:
     """Bodies one below the other, side by side for several hands or fingers: arrays [level, ...].
 
-    offset, turn: of a body in its parent; axis: of its hinge in its own frame (0 where it has none); dof: the hinge's.
+    offset, turn: of a body in its parent; axis: of its hinge in its own frame (0 if it has none); dof: the hinge's.
     """
 
     offset: np.ndarray
@@ -487,7 +487,7 @@ _Frame = tuple[jax.Array, ...]  # place, quaternion, velocity and spin in the wo
 def _fingertips(chains: tuple[_Links, _Links], physics: PhysicsState) -> jax.Array:
     """Frames [2, 5, 13] of the distal links at their joints: position, quaternion, velocity and spin, world frame.
 
-    Engines leave these a substep behind qpos; here they belong to it, also where no step led.
+    Engines leave these a substep behind qpos; here they belong to it, also in a state that no step led to.
     """
     palms, fingers = chains
     nothing = jnp.zeros((HANDS, 3), physics.qpos.dtype)

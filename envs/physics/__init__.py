@@ -6,7 +6,7 @@
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
 | `warp`   | NVIDIA GPU    | MJX with the MuJoCo-Warp implementation                             |
 
-Signatures are those of one environment; batches come from `jax.vmap`, nested as one likes.
+Signatures are those of one environment; batches come from `jax.vmap`, nested to any depth.
 
 Examples:
   >>> import jax, mujoco
@@ -72,8 +72,8 @@ def make_engine(
         and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors
         grow to 1e-3.
       fast_contacts: names of the geoms that keep their contacts when the solver is fast; empty keeps all.
-      threads: of the `mujoco` engine; the process's usable CPUs where None.
-      contacts: of the `warp` engine: room for so many contacts in a world; derived from the model where None.
+      threads: of the `mujoco` engine; the process's usable CPUs if None.
+      contacts: of the `warp` engine: room for so many contacts in a world; derived from the model if None.
 
     Raises:
       TaskError: unknown engine or solver, or an engine that cannot run here.

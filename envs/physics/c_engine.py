@@ -1,6 +1,6 @@
 """The `mujoco` engine: MuJoCo's C engine on threads, called by XLA once per control step.
 
-A step is run by `native_batch`, or by `thread_team` where a readout needs `mj_rnePostConstraint`.
+`thread_team` runs a step if a readout needs `mj_rnePostConstraint`, else `native_batch` does.
 """
 
 # mujoco is a binary module without stubs:

@@ -76,9 +76,9 @@ class Engine(Protocol):
 
         Returns:
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
-          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. Beside them stands
-          `overflow`, 1 where the step found no room for all contacts or constraints and is wrong, else 0: only warp
-          has buffers that can be too small without raising.
+          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. The
+          readout `overflow` is 1 if the step found no room for all contacts or constraints and is wrong, else 0: only
+          warp has buffers that can be too small without raising.
         """
         ...
 
@@ -102,7 +102,7 @@ _PREFERENCE = ("mujoco", "warp", "mjx")  # the first that can run: the first two
 
 
 def obstacle(physics: str) -> str | None:
-    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None where it can."""
+    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can."""
     device = jax.devices()[0]
     if physics == "mujoco" and device.platform != "cpu":
         return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
@@ -115,7 +115,7 @@ def obstacle(physics: str) -> str | None:
 
 
 def explain() -> dict[str, str | None]:
-    """For each engine the obstacle to running it here, None where there is none."""
+    """For each engine the obstacle to running it here, None if there is none."""
     return {name: obstacle(name) for name in ENGINES}
 
 

@@ -7,7 +7,7 @@ views of XLA's own buffers, and the program on disk holds only the name.
 
 The C structures below are version 0.3 of XLA's FFI ABI (`jaxlib/include/xla/ffi/api/c_api.h`); XLA supports an ABI
 version for at least twelve months and only ever appends fields; `tests/envs/physics/test_host_call.py` fails
-where that ends.
+when that ends.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def _line_search(cond: Any, body: Any, init: Any, max_iter: int) -> Any:
 
     MJX then takes the end with the lower cost, or stays where it was if neither is lower than there. In float32 the
     cost is too coarse to show what the last Newton step gains (1e-3 of 1e5, and 0.1 in qacc), whereas the slope still
-    shows it. So where costs agree to rounding, the end with the smaller slope is given the lower cost.
+    shows it. So if costs agree to rounding, the end with the smaller slope is given the lower cost.
     """
 
     def proceed(carry: Any) -> jax.Array:
@@ -156,7 +156,7 @@ def _ball_box(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Distance, position and frame of a ball's contact with a box of half sizes `size` [3].
 
-    The normal points to the box's nearest point; to the inside of the nearest face where the centre is in the box.
+    The normal points to the box's nearest point; to the inside of the nearest face if the centre is in the box.
     """
     from mujoco.mjx._src.math import make_frame
 

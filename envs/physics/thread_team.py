@@ -82,7 +82,7 @@ class _Worker:
         np.concatenate(self._outputs, out=out, casting="same_kind")
 
     def check_memory(self) -> None:
-        """Raises where contacts found no room, which C drops with a warning only."""
+        """Raises if contacts found no room, which C drops with a warning only."""
         if any(self._warnings[kind].number > 1 for kind in LOST):
             raise MemoryError(NO_ROOM)
 

@@ -69,7 +69,7 @@ class WarpEngine:
         return jax.vmap(one)(state, ctrl)
 
     def rehearse(self) -> None:
-        """The launches of `step`, which depend on no batch, for one world and without XLA; see `warp_kernels`."""
+        """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
         from mujoco.mjx.third_party import mujoco_warp
 
         model = mujoco_warp.put_model(self._c_model)
@@ -95,7 +95,7 @@ class WarpEngine:
 
 
 def _quieten() -> None:
-    """Keeps Warp's lines about itself and every kernel to those who ask this package's logger for information."""
+    """Prints Warp's lines about itself and every kernel only if this package's logger has level INFO."""
     import warp
 
     asked = logging.getLogger(__name__).isEnabledFor(logging.INFO)

@@ -1,6 +1,6 @@
 """Warp's kernels before the first step. Warp itself compiles each where it is first launched, one after the other.
 
-Which kernels a model needs is known only to MuJoCo-Warp's step, so a step is rehearsed: its launches are noted, and
+Only MuJoCo-Warp's step determines which kernels a model needs, so a step is rehearsed: its launches are recorded, and
 nothing runs.
 """
 
@@ -26,7 +26,7 @@ _Launches = dict[tuple[Any, int], None]  # Warp's modules, and the threads a blo
 def needed() -> list[Callable[[], Any]]:
     """What the steps of all engines launch; each entry compiles a part and loads it, on any thread.
 
-    Warp's unit is a module, most of which hold one kernel. A module that its cache holds is only loaded.
+    Warp compiles modules, most of which hold one kernel. A module in Warp's cache is only loaded.
     """
     import warp
 
@@ -43,7 +43,7 @@ _HOOKING = threading.Lock()
 
 @contextlib.contextmanager
 def _noted() -> Iterator[_Launches]:
-    """Yields the launches of this thread, which do not happen: Warp launches nothing whose module does not load."""
+    """Yields the launches of this thread without running them: Warp launches nothing whose module does not load."""
     import warp
     from warp._src.context import Module
 

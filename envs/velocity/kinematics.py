@@ -21,7 +21,7 @@ class _Bodies(NamedTuple):
 
     Attributes:
       parent: [n]; pos: [n, 3]; quat: [n, 4].
-      axis, anchor: [n, J, 3] in the body's frame; dof: [n, J] of the joint, one behind the last where there is none.
+      axis, anchor: [n, J, 3] in the body's frame; dof: [n, J] of the joint, one behind the last if there is none.
     """
 
     parent: np.ndarray

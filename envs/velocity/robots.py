@@ -31,7 +31,7 @@ class Robot:
       axes: entries of the place that are kept, x and perhaps y.
       speed: what costs: the norm of the velocity, the size of its x, or its x with the sign.
       forward, survival, control: weights of x velocity (1 / (m/s)), of a step, and of the sum of squared actions.
-      healthy: False ends the episode; None where nothing does.
+      healthy: False ends the episode; None if nothing does.
       noise: half-width of the uniform noise on qpos (quaternion included) and on qvel at the start.
       normal_velocity: the noise on qvel is normal with this standard deviation instead.
       unseen: first entries of qpos that the state leaves out.

@@ -79,15 +79,15 @@ class Velocity:
 
     Args:
       variant: one of `envs.velocity.VARIANTS`.
-      threshold: m/s, a faster step costs; the benchmark's where None.
-      partition: the actuators of each agent, e.g. `[[0, 1, 2], [3, 4, 5]]`; the benchmark's where None.
+      threshold: m/s, a faster step costs; the benchmark's if None.
+      partition: the actuators of each agent, e.g. `[[0, 1, 2], [3, 4, 5]]`; the benchmark's if None.
       cost: `indicator` (1 above the threshold), or `excess` (how far above it, as a share of the threshold, at most 1).
       fall_cost: adds a second cost, 1 where the episode ends by the robot's rule of health; limit 0.1.
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
         keep running moments).
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
-      threads: of the `mujoco` engine; all usable CPUs where None.
+      threads: of the `mujoco` engine; all usable CPUs if None.
     """
 
     @typed
@@ -201,10 +201,10 @@ class Velocity:
         Args:
           qpos: [nq] positions; a quaternion is normalised if it is not.
           qvel: [nv] velocities.
-          warmstart: [nv] `qacc_warmstart`; zero where None.
-          torso_xpos: [3], of the ant alone, where the last control step left the torso's `xpos`; that of qpos where
+          warmstart: [nv] `qacc_warmstart`; zero if None.
+          torso_xpos: [3], of the ant alone, where the last control step left the torso's `xpos`; that of qpos if
             None.
-          com: [2], of the humanoid alone, where it left the centre of mass; that of qpos where None.
+          com: [2], of the humanoid alone, where it left the centre of mass; that of qpos if None.
         """
         start = self._engine.start()
         dtype = start.qpos.dtype

@@ -78,7 +78,7 @@ def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: 
     """Least line losses with voltages in the band, knowing the row to come and every bus: a bound, not a controller.
 
     Adam on the actions through the differentiable power flow. Leaving the band costs `price` MW per p.u. and bus, from
-    `margin` p.u. inside of it on; so where the band cannot be kept, the violation is made small.
+    `margin` p.u. inside of it on; if the band cannot be kept, the violation becomes small.
     """
     lower, upper = env.v_lower + margin, env.v_upper - margin
 
@@ -107,6 +107,6 @@ POLICIES: dict[str, Callable[[VoltageControl], Policy]] = {"zero": zero, "random
 
 
 def q_to_action(env: VoltageControl, state: State, q: jax.Array) -> jax.Array:
-    """[N, 1] the action that sets reactive powers `q` [N] MVAr in the next step; beyond [-1, 1] where it cannot."""
+    """[N, 1] the action that sets reactive powers `q` [N] MVAr in the next step; beyond [-1, 1] if it cannot."""
     limit = env.scenario.action_scale * env.q_limit(state.carry.row)
     return (q / jnp.maximum(limit, 1e-9))[:, None]

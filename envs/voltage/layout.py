@@ -16,7 +16,7 @@ def layout(branches: np.ndarray, root: int, count: int) -> tuple[np.ndarray, np.
       count: n, buses.
 
     Returns:
-      [n] x and [n] y, each scaled to 0 to 1 (0.5 where all are equal).
+      [n] x and [n] y, each scaled to 0 to 1 (0.5 if all are equal).
     """
     hops, children = _tree(branches, root, count)
     reach = _reach(hops, children, root)
@@ -56,7 +56,7 @@ def _rows(
 
 
 def _tree(branches: np.ndarray, root: int, count: int) -> tuple[list[int], list[list[int]]]:
-    """Breadth first from `root`: hops [n] (0 where nothing leads) and the buses that each one feeds."""
+    """Breadth first from `root`: hops [n] (0 if nothing leads there) and the buses that each one feeds."""
     neighbours: list[list[int]] = [[] for _ in range(count)]
     for a, b in np.asarray(branches).tolist():
         neighbours[a].append(b)

@@ -78,7 +78,7 @@ class Network:
 
 
 class PowerFlow(NamedTuple):
-    """A solved state; every number is nan where the flow did not converge.
+    """A solved state; every number is nan if the flow did not converge.
 
     Attributes:
       vm_pu, va_rad: [n] voltage magnitudes and angles (the slack's is 0).
@@ -121,7 +121,7 @@ def solve(
     power at a bus that is not one of its injection buses, comes back with `converged` False and nan everywhere.
 
     Args:
-      tolerance: p.u.; the dtype's entry in TOLERANCE where None.
+      tolerance: p.u.; the dtype's entry in TOLERANCE if None.
       max_iterations: of the accelerated fixed point, before a state counts as unsolvable.
 
     Examples:
@@ -430,7 +430,7 @@ def load_network(name: str, inject: Sequence[int] | None = None) -> Network:
 
     Args:
       name: one of NETWORKS.
-      inject: the buses that may inject or consume power; all but the slack where None. Fewer buses solve faster.
+      inject: the buses that may inject or consume power; all but the slack if None. Fewer buses solve faster.
     """
     table = load_table(name)
     return radial_network(table["parent"], table["r"], table["x"], float(table["base_mva"]), inject=inject, name=name)

@@ -207,7 +207,7 @@ def _check_units(path: Path, profiles: Profiles) -> None:
 
 
 def save_profiles(path: str | Path, profiles: Profiles) -> None:
-    """Writes `profiles` to an npz that loads in a moment, where MAPDN's csv files take half a minute.
+    """Writes `profiles` to an npz that loads in a moment; MAPDN's csv files take half a minute.
 
     Rows that lie on straight lines between 15-minute knots, as MAPDN's do, are stored as these knots.
     """
@@ -217,7 +217,7 @@ def save_profiles(path: str | Path, profiles: Profiles) -> None:
 
 
 def at_knots(profiles: Profiles, tolerance: float = 2e-6) -> Profiles | None:
-    """The 15-minute knots of 3-minute rows, or None where rows stray from straight lines by more than `tolerance` MW.
+    """The 15-minute knots of 3-minute rows, or None if rows stray from straight lines by more than `tolerance` MW.
 
     Knots are rows 0, 5, 10, ...; profiles whose straight lines break at other rows are left alone.
     """
@@ -272,7 +272,7 @@ def _on_network(
     """Scales unit profiles to the network, as MAPDN's paper describes.
 
     Args:
-      solar: [K, any] one column per region, repeated where there are more regions.
+      solar: [K, any] one column per region, repeated if there are more regions.
       load: [K, n_load]; sizes follow the nominal loads, their common peak is in PEAK_LOAD.
     """
     region = table["zone"][table["pv_bus"]]

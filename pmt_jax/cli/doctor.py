@@ -46,7 +46,7 @@ class Finding(NamedTuple):
     Attributes:
       mark: `ok`, `no` for what cannot be used but need not be, `bad` for what keeps pmt-jax from working.
       what: the part looked at.
-      text: what was found, and where it is not well what to do.
+      text: what was found and, if it is a problem, what to do.
     """
 
     mark: Literal["ok", "no", "bad"]
@@ -77,7 +77,7 @@ def report(say: Callable[[str], None]) -> int:
 
 
 def examine() -> Iterator[Finding]:
-    """Looks at everything in turn. Where JAX is missing or a version is wrong, what would need it is left out."""
+    """Looks at everything in turn. If JAX is missing or a version is wrong, the checks that need it are left out."""
     yield Finding("ok", "pmt-jax", f"{pmt_jax.__version__} in {os.path.dirname(pmt_jax.__file__)}")
     yield Finding("ok", "python", f"{platform.python_version()} on {platform.platform()}")
     found = {name: tasks.installed_version(name) for name in PACKAGES}

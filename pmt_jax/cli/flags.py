@@ -45,7 +45,7 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 class _Help(argparse.Action):
-    """--help, where what the settings are for the task and flags before it is read only now."""
+    """--help, which reads the settings of the task and the flags before it when it is reached."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(nargs=0, **options)

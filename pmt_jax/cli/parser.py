@@ -49,7 +49,7 @@ def _actions(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> lis
 
 
 def refuse_unknown(argv: Sequence[str], commands: Iterable[str]) -> None:
-    """Names the nearest command where the first word is none; argparse would list them all."""
+    """Names the nearest command if the first word is none; argparse would list them all."""
     if argv and not argv[0].startswith("-") and argv[0] not in commands:
         raise UsageError(f"unknown command '{argv[0]}'{did_you_mean(argv[0], commands)}")
 

@@ -52,7 +52,7 @@ def at_once() -> Iterator[None]:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
-        yield  # ignored, as in the background, or in the hands of whoever runs us
+        yield  # ignored, as in the background, or handled by the calling program
         return
     signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
     try:

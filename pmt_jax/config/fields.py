@@ -48,7 +48,7 @@ def _setting(group: str, default: Any, text: str, bound: Bound | None = None) ->
 
     Args:
       group: a key of GROUPS.
-      default: what the setting is where no file and no flag names it.
+      default: the value if no file and no flag names it.
       text: what it means, for `--help` and the documents.
       bound: what its value must satisfy, beyond its type.
     """

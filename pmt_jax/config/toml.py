@@ -32,7 +32,7 @@ def _names(folder: pathlib.Path) -> list[str]:
 
 
 def about(name: str) -> str:
-    """The sentence in which a file of configs/ describes itself; '' where it has none."""
+    """The sentence in which a file of configs/ describes itself; '' if it has none."""
     path = CONFIG_DIR / f"{name}.toml"
     return str(_parse(path).get("about", "")) if path.is_file() else ""
 

@@ -31,7 +31,7 @@ def check_finite(setup: Setup, update: jax.Array, **named: Any) -> None:
 
     Args:
       update: [] int32, the number of the update that computes them.
-      **named: pytrees by the names that the message shall show.
+      **named: pytrees by the names that the message shows.
     """
     if not setup.debug:
         return
@@ -57,7 +57,7 @@ def watched(setup: Setup, update: jax.Array) -> tasks.VectorEnv:
 
 
 class _Watched:
-    """An environment that hands every state it makes to `check`."""
+    """An environment that passes each of its states to `check`."""
 
     def __init__(self, env: tasks.Env, check: Callable[..., None]) -> None:
         self._env, self._check = env, check

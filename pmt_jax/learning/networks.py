@@ -74,7 +74,7 @@ class Networks:
     """The functions of a run's networks; weights live elsewhere.
 
     Attributes:
-      num_actors: N, or 1 where all agents share one.
+      num_actors: N, or 1 if all agents share one.
       num_agents: N.
     """
 
@@ -111,7 +111,7 @@ class Networks:
         return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start))
 
     def awaken_fear(self, params: Params, cost_rate: jax.Array) -> Params:
-        """Starts fear at the observed `cost_rate` [N, K] where it has begun at nan; other weights stay as they are."""
+        """Starts fear at the observed `cost_rate` [N, K] if it began at nan; other weights stay as they are."""
         rate = jnp.clip(cost_rate, 1e-3, 1 - 1e-3)
         bias: jax.Array = params["params"][self.fear_head]["bias"].reshape(rate.shape)
         return self._with_fear_bias(params, jnp.where(jnp.isnan(bias), jnp.log(rate / (1 - rate)), bias))
@@ -148,7 +148,7 @@ class Networks:
     def layers(self, params: Params) -> dict[str, jax.Array]:
         """The mean's weights under plain names, for every layer i and with a leading [N].
 
-        kernel_i [N, I, J] and bias_i [N, J]; norm_scale_i and norm_bias_i [N, I] where layer i's input is normalised.
+        kernel_i [N, I, J] and bias_i [N, J]; norm_scale_i and norm_bias_i [N, I] if layer i's input is normalised.
         """
         trunk = params["params"]["trunk"]
         first = 0 if self.actor.trunk.input_norm else 1  # the first layer whose input may be normalised

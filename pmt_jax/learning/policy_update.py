@@ -94,7 +94,7 @@ def _sequential(
         actor, multiplier, factor = carry
         mine = dataclasses.replace(_select_agent(rows, i), factor=factor)
         key = jax.random.fold_in(tagged[Tag.ACTOR], i)
-        excess = cost_excess[i] + multiplier[i]  # beyond a lowered limit; only a trust region asks for it
+        excess = cost_excess[i] + multiplier[i]  # beyond a lowered limit; only a trust region uses it
         net, metrics = update_policy(setup, hyper, _select_agent(actor, i), mine, excess, key)
         log_ratio, metrics["kl_per_agent"] = _policy_change(setup, net.params, mine)
         updated = _update_multiplier(setup, hyper, multiplier[i], mine, cost_excess[i], log_ratio, metrics)

@@ -108,7 +108,7 @@ def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
 
 
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
-    """Mean of `x` [T, B, ...] over the steps that ended an episode; nan where none did."""
+    """Mean of `x` [T, B, ...] over the steps that ended an episode; nan if none did."""
     done = batch.done.reshape(batch.done.shape + (1,) * (x.ndim - 2))
     return jnp.sum(x * done, (0, 1)) / done.sum()  # 0 / 0 is nan
 
@@ -164,7 +164,7 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
 
 
 def _each_cost(batch: Batch) -> dict[str, jax.Array]:
-    """The episode costs one by one, where there are several: `episode_cost/k` and `true_episode_cost/k`."""
+    """The episode costs one by one, if there are several: `episode_cost/k` and `true_episode_cost/k`."""
     costs = {"episode_cost": batch.episode_cost, "true_episode_cost": batch.true_episode_cost}
     count = batch.cost.shape[-1]
     return {

@@ -21,10 +21,10 @@ from .types import RunningMoments
 
 @dataclasses.dataclass(frozen=True)
 class Trials:
-    """What trains side by side in one program where it is more than the seeds of one run: a part of a sweep.
+    """What trains side by side in one program if it is more than the seeds of one run: a part of a sweep.
 
     Attributes:
-      hyper: every lane's own settings, leaves [L], or [] where all share them; seed: [L] int32.
+      hyper: every lane's own settings, leaves [L], or [] if all share them; seed: [L] int32.
     """
 
     hyper: Hyper
@@ -52,7 +52,7 @@ class Setup:
     def limits(self) -> np.ndarray:
         """Allowed undiscounted felt cost of one agent per episode: [K], one for each cost.
 
-        The config's; where that is left open, what an episode that truly costs the task's limit d is expected to be
+        The config's; if that is nan, what an episode that truly costs the task's limit d is expected to be
         felt as: cost_seen d + cost_false (horizon - d).
         """
         config, count = self.config, self.vector.spec.num_costs
@@ -75,7 +75,7 @@ class Setup:
 
     @property
     def overflow(self) -> str | None:
-        """The metric that is above 0 where the physics lost contacts; None where the task declares none."""
+        """The metric that is above 0 if the physics lost contacts; None if the task declares none."""
         name = tasks.declarations(self.vector.env).overflow
         return None if name is None else f"info/{name}"
 

@@ -28,10 +28,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def make_mesh(config: Config, count: int | None) -> Mesh | None:
-    """The devices of a run as (seed, env); None where there is one.
+    """The devices of a run as (seed, env); None if there is one.
 
     Args:
-      count: how many, of all processes together; None takes one, or all where there are several processes.
+      count: how many, of all processes together; None takes one, or all if there are several processes.
 
     Raises:
       UsageError: there are fewer, or they cannot have equal parts of the seeds and environments.

@@ -16,7 +16,7 @@ from ..tasks import VectorState
 from .maths.pytree import pytree
 from .maths.running_moments import RunningMoments
 
-Params = Any  # a pytree of network weights; for actors every leaf has a leading [N] ([1] where one actor is shared)
+Params = Any  # a pytree of network weights; for actors every leaf has a leading [N] ([1] if one actor is shared)
 
 jax.tree_util.register_dataclass(Hyper, data_fields=HYPER_FIELDS, meta_fields=())
 
@@ -80,7 +80,7 @@ class Batch:
       info: {name: [T, B]}.
       non_finite: [T, B] bool, quarantined steps.
       episode_reward: [T, B], episode_cost and true_episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to
-        and with this step; complete where the episode is done.
+        and with this step; complete if the episode is done.
     """
 
     obs: jax.Array
@@ -155,7 +155,7 @@ class LearnerState(ActingState):
       actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
-        that do not feel them.
+        without them.
       multiplier: [N, K], lambda; with `lambda_rule = pid` its integral; of MACPO what its limit is lowered by,
         in cost per step.
       episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier is updated with.
@@ -181,7 +181,7 @@ class Best:
 
     Attributes:
       state: the learner state.
-      reward, cost: [seeds] f32, mean episode reward and cost; -inf and inf where nothing is known yet.
+      reward, cost: [seeds] f32, mean episode reward and cost; -inf and inf if nothing is known yet.
     """
 
     state: LearnerState

@@ -31,7 +31,7 @@ def evaluate_run(
     say: Say = print,
     save: pathlib.Path | None = None,
 ) -> list[dict[str, Any]]:
-    """One row per seed of a run: each figure's mean over episodes and the half-width of its 95 % interval.
+    """One row per seed of a run: each metric's mean over episodes and the half-width of its 95 % interval.
 
     A state that was chosen, a pretrained policy or `best`, is evaluated from other starts than it was chosen by.
 

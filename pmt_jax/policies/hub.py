@@ -77,7 +77,7 @@ def save(name: str, config: Config, state: ActingState, facts: dict[str, Any]) -
     Args:
       config: of its run.
       state: of one seed, with a leading [1].
-      facts: what `about` shall answer; `seed` says which of the run's seeds it is.
+      facts: what `about` returns; `seed` says which of the run's seeds it is.
 
     Raises:
       UsageError: the file cannot be written.
@@ -98,7 +98,7 @@ def tell(name: str, facts: dict[str, Any]) -> None:
 
 
 def rounded(state: ActingState) -> ActingState:
-    """What `load` gives back of a state that was saved."""
+    """The state that `load` returns for a saved one."""
     return checkpoint.unpack(_widened(_narrowed(checkpoint.pack(state))), state)
 
 

@@ -64,7 +64,7 @@ def load_run(
     """A run's settings and a learner state of it, with a leading [seeds].
 
     Args:
-      folder: the run folder, or the name of a pretrained policy, of which there is but what acts of one seed.
+      folder: the run folder, or the name of a pretrained policy, which holds only what acts, of one seed.
       which: `last`, or `best`: each seed's own best (see docs/howto/evaluate.md).
       physics: an engine other than the run's.
       warn: called with a sentence for each damaged checkpoint, which is passed over.

@@ -23,7 +23,7 @@ def load(path: str | os.PathLike[str]) -> Callable[[np.ndarray], np.ndarray]:
     """The policy in `path`: obs [..., N, O] -> mean action [..., N, A].
 
     The file holds obs_mean [O], obs_scale [O], obs_clip [], activation (its name), action_mask [N, A] and for each
-    layer i kernel_i [N, I, J], bias_i [N, J] and, where its input is normalised, norm_scale_i and norm_bias_i [N, I].
+    layer i kernel_i [N, I, J], bias_i [N, J] and, if its input is normalised, norm_scale_i and norm_bias_i [N, I].
     """
     with np.load(path) as file:
         w = dict(file)

@@ -1,4 +1,4 @@
-"""Makes pretrained policies of run folders: of each the best seed's best or last, judged by a fresh evaluation.
+"""Makes a pretrained policy of a run folder: the best seed's best or last state, judged by a fresh evaluation.
 
 `python -m bench publish RUN...` does this in a checkout. All values are means over whole episodes with mean actions;
 the published ones are from other starts than those that chose the policy. A policy is better by the rule that
@@ -82,7 +82,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
     rows = evaluate_states(run, both, episodes, deterministic=True, fresh=False)
     reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
-    # A limit that training did not know does not count: MAPPO's best would be a policy that has hardly learned.
+    # A limit that training did not use does not count: MAPPO's best would be a policy that has hardly learned.
     limit = np.inf if run.method.constraint == "none" else run.cost_limit
     chosen, reached = None, (np.array(-np.inf), np.array(np.inf))
     for i, new in enumerate(zip(reward, cost, strict=True)):

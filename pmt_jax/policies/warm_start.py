@@ -26,7 +26,7 @@ LEARNED = (*ACTING, "critic", "cost_critic", "fear", "regret", "state_moments")
 def prepare(setup: Setup) -> Change | None:
     """What turns the first state of a run [seeds] into the one that `init` and `init_fear` ask for; None without them.
 
-    Seed i takes what the other run's seed i has learned, counted round where that run has fewer seeds. Optimisers,
+    Seed i takes what the other run's seed i has learned, counted round if that run has fewer seeds. Optimisers,
     multipliers, environments and keys begin anew.
 
     Raises:
@@ -73,7 +73,7 @@ def _networks(source: str, like: LearnerState) -> dict[str, Any]:
 
 
 def _fear(source: str, like: LearnerState, setup: Setup) -> dict[str, Any]:
-    """The fear of the other run and its moments of states; where teams differ, all agents begin with the mean fear."""
+    """The fear of the other run and its moments of states; if teams differ, all agents begin with the mean fear."""
     other, state = load_run(pathlib.Path(source))
     if like.fear is None:
         raise UsageError(f"init_fear is for methods with a fear network (f4sg, mixed), not for {setup.config.method}")

@@ -59,7 +59,7 @@ class Episode:
         return {name: x[t] for name, x in self.raw.items()}
 
     def cut(self, moments: slice) -> Episode:
-        """The part of it that pictures shall show; a cost between two moments counts at the later one."""
+        """The part of it that pictures show; a cost between two moments counts at the later one."""
         names = ("raw", "step", "reward", "reward_sum", "cost_sum", "info", "action")
         arrays = jax.tree.map(lambda x: x[moments], {name: getattr(self, name) for name in names})
         kept = np.arange(len(self))[moments]
@@ -73,7 +73,7 @@ def record_run(folder: pathlib.Path, seed: int | None = None, number: int = 0, d
 
     Args:
       folder: the run folder, or the name of a pretrained policy.
-      seed: of the run's seeds; its first where None.
+      seed: of the run's seeds; its first if None.
       number: which of the fixed starts.
       deterministic: take the mean action instead of a sample.
 

@@ -38,7 +38,7 @@ def render(
 
     Args:
       folder: of the run.
-      seed: of the run's seeds, its first where None.
+      seed: of the run's seeds, its first if None.
       number: which of the fixed starts.
       deterministic: take the mean action instead of a sample.
       moments: the control steps to show, 0 being the reset.
@@ -126,7 +126,7 @@ def _write_film(frames: Iterator[np.ndarray], out: pathlib.Path, fps: float, siz
     command = [ffmpeg, "-v", "error", "-y", *taken.split(), *made.split(), str(out)]
     film = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
     assert film.stdin is not None
-    with contextlib.suppress(BrokenPipeError):  # it has given up, and says below why
+    with contextlib.suppress(BrokenPipeError):  # ffmpeg has ended; its error is reported below
         for frame in frames:
             film.stdin.write(np.ascontiguousarray(frame))
     _, complaint = film.communicate()

@@ -18,13 +18,13 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), mujoco.mjtFontSca
 
 
 def backends() -> tuple[str, ...]:
-    """What may work on this system, the fastest first; MUJOCO_GL, where set, is the only one."""
+    """What may work on this system, the fastest first; MUJOCO_GL, if set, is the only one."""
     wanted = os.environ.get("MUJOCO_GL")
     return (wanted,) if wanted else _BACKENDS.get(sys.platform, ("glfw",))
 
 
 def obstacle(backend: str) -> str | None:
-    """Why a backend does not draw here, None where it does.
+    """Why a backend does not draw here, None if it does.
 
     A backend that fails leaves PyOpenGL unusable for the next, or kills its process, so each is tried in a new one.
     """

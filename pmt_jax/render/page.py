@@ -42,7 +42,7 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
 
     Args:
       rate: control steps a second.
-      play: begin at once (never where the reader's system asks for little motion).
+      play: begin at once (never if the reader's system requests little motion).
     """
     kind = episode.picture.kind
     data: dict[str, Any] = {
@@ -103,7 +103,7 @@ def _numbers(x: np.ndarray) -> list[float]:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table that scrolls by itself where it is wider than the screen; columns of numbers are aligned to the right."""
+    """A table that scrolls by itself if it is wider than the screen; columns of numbers are aligned to the right."""
     lines = [list(row) for row in rows]
     numeric = [i > 0 and all(NUMBER.match(row[i]) for row in lines) for i in range(len(head or lines[0]))]
 

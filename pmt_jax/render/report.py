@@ -28,7 +28,7 @@ def report(
     If a run lacks something (a checkpoint, for example), the page has a note in its place.
 
     Args:
-      folders: runs, or folders of runs; what holds none is left out with a note.
+      folders: runs, or folders of runs; other folders are left out with a note.
       out: an .html file.
       episodes: of the evaluation, per seed and kind of action.
 
@@ -59,7 +59,7 @@ def _heading(title: str, logs: Sequence[RunLog]) -> list[str]:
 
 
 def _table(logs: Sequence[RunLog]) -> list[str]:
-    """What `pmt table` says of the runs."""
+    """The table that `pmt table` prints of the runs."""
     head, lines, notes = table.cells(rows(logs, note=lambda _: None))
     explained = f"<details><summary>What the columns mean</summary><p>{html.escape(' '.join(notes))}</p></details>"
     return ["<h2>Scores</h2>", page.table([*head[1:2], *head[:1], *head[2:]], _method_first(lines)), explained]
@@ -109,7 +109,7 @@ def _run_section(log: RunLog, episodes: int) -> list[str]:
     return [
         f"<section>\n<h2>{html.escape(log.folder.name)}</h2>",
         f"<p>{html.escape(_summary(log))}</p>",
-        *dict.fromkeys(played),  # what both lack is told once
+        *dict.fromkeys(played),  # what both lack is reported once
         *_details("Settings", log.settings),
         *_details("Versions", log.versions),
         "</section>",

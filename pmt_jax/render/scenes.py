@@ -40,7 +40,7 @@ def scenes(episode: Episode) -> Iterator[mujoco.MjvScene]:
 
 
 def camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
-    """The model's first camera, or MuJoCo's default view of the whole where it has none."""
+    """The model's first camera, or MuJoCo's default view of the whole if it has none."""
     view = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, view)
     if model.ncam:

@@ -19,9 +19,9 @@ class Comparison(NamedTuple):
     """A row against the baseline's, by column as `more reward`, `less cost`.
 
     Attributes:
-      better: {name: {probability, low, high}} of a seed doing better, None where a seed has no score.
+      better: {name: {probability, low, high}} of a seed doing better, None if a seed has no score.
       p: {name: p} of Mann and Whitney's U test with Holm's correction over the rows of a task and the column; None
-        where a seed has no score.
+        if a seed has no score.
     """
 
     better: dict[str, Estimate]
@@ -35,7 +35,7 @@ def with_baseline(rows: Sequence[Row], baseline: str) -> dict[tuple[str, str], C
       baseline: a row's label, or a method with no more than one row per task.
 
     Raises:
-      UsageError: no row, or several of one task, are called like the baseline.
+      UsageError: no row, or several of one task, have the baseline's name.
     """
     columns = compared(rows)
     found = {}
@@ -72,7 +72,7 @@ def baselines(rows: Sequence[Row], baseline: str) -> dict[str, Row]:
     """The row that the others are held against, of every task that has it.
 
     Raises:
-      UsageError: no row, or several of one task, are called so.
+      UsageError: no row, or several of one task, have that name.
     """
     result: dict[str, Row] = {}
     for task in dict.fromkeys(row.task for row in rows):
@@ -107,6 +107,6 @@ def _improvements(ours: Sequence[Row], theirs: Sequence[Row], columns: tuple[str
 
 
 def _scores(rows: Sequence[Row], column: str) -> list[np.ndarray] | None:
-    """The seeds' scores of each row; None where one has none."""
+    """The seeds' scores of each row; None if one has none."""
     found = [row.score(column) for row in rows]
     return found if all(np.isfinite(scores).all() for scores in found) else None

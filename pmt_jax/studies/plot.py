@@ -68,7 +68,7 @@ def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = 
     """Draws the curves of run folders into `out` (.png, .svg or .pdf): a row of panels a task, a colour a method.
 
     Args:
-      note: told of folders that are left out.
+      note: called with a sentence for each folder that is left out.
 
     Raises:
       UsageError: a folder that cannot be read, no run at all, another ending, or `out` that cannot be written.
@@ -78,7 +78,7 @@ def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = 
 
 
 def check_ending(out: pathlib.Path) -> None:
-    """Raises UsageError where `out` is no kind of picture."""
+    """Raises UsageError if `out` is not a picture."""
     if out.suffix not in ENDINGS:
         raise UsageError(f"cannot write {out}: its ending must be .png, .svg or .pdf")
 
@@ -89,7 +89,7 @@ def pooled(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
 
 
 def looks(shown: Sequence[Group]) -> list[Look]:
-    """A method has its colour and its settings have dashes; where there is but one method, settings have colours."""
+    """A method has its colour and its settings have dashes; if there is only one method, settings have colours."""
     methods = list(dict.fromkeys(group.method for group in shown))
     result, seen = [], dict.fromkeys(methods, 0)
     for number, group in enumerate(shown):
@@ -119,7 +119,7 @@ def caption(shown: Sequence[Group]) -> str:
 
 
 def panels(shown: Sequence[Group], wanted: dict[str, str]) -> list[str]:
-    """The metrics among `wanted` that any run has; true costs only where a run did not feel all of them."""
+    """The metrics among `wanted` that any run has; true costs only if a run did not feel all of them."""
 
     def known(name: str) -> bool:
         return any(np.isfinite(run.metrics.get(name, np.nan)).any() for group in shown for run in group.runs)
@@ -238,7 +238,7 @@ def _spread(axis: Any, x: float, values: np.ndarray, colour: str) -> None:
 
 
 def cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
-    """The limit as a dashed line; linear up to it, logarithmic beyond where costs are many times as high."""
+    """The limit as a dashed line; linear up to it, logarithmic beyond if costs are many times as high."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
     limits = sorted({group.true_limit if name.startswith("true") else group.cost_limit for group in shown})

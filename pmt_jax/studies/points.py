@@ -127,7 +127,7 @@ def _word(value: Any) -> str:
 
 
 def drawn(parts: Sequence[Part], points: Points) -> dict[str, Any]:
-    """What was drawn for each point, from where and with which seed; empty where nothing was."""
+    """What was drawn for each point, from where and with which seed; empty if nothing was."""
     names = {name for part in parts for name in part.ranges}
     ranges = [{"seed": part.seed, **{k: r._asdict() for k, r in part.ranges.items()}} for part in parts if part.ranges]
     values = {name: {k: getattr(config, k) for k in sorted(names)} for name, config in points.items()}
@@ -160,7 +160,7 @@ def from_words(source: Source, words: Sequence[str], draws: int = 0, seed: int =
 
 
 def _range(text: Any) -> Range | None:
-    """LOW:HIGH or log:LOW:HIGH; None where it is neither."""
+    """LOW:HIGH or log:LOW:HIGH; None if it is neither."""
     number = r"[+-]?[\d.]+(?:e[+-]?\d+)?"
     match = re.fullmatch(rf"(log:)?({number}):({number})", text) if isinstance(text, str) else None
     if match is None:

@@ -1,7 +1,7 @@
 """Rows of a table: one score per seed and column, pooled over runs that share task, method and settings.
 
 A score is a metric's mean over the last tenth of the steps, of the evaluations made there (`eval/...` in metrics.jsonl:
-whole episodes under mean actions) where the run made any, else of the training episodes that ended there (sampled
+whole episodes under mean actions) if the run made any, else of the training episodes that ended there (sampled
 actions).
 """
 
@@ -74,10 +74,10 @@ class Row:
     Attributes:
       task, method: their names; settings: what differs from other rows of the same task, as `name=value`.
       cost_limit: allowed cost of one agent per episode.
-      steps: environment steps per seed (the fewest, where runs differ).
+      steps: environment steps per seed (the fewest, if runs differ).
       source: `evaluation` or `training`, what the scores are taken from.
-      scores: {column: [seeds]} in the task's units; nan where a seed has none.
-      excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` where None.
+      scores: {column: [seeds]} in the task's units; nan if a seed has none.
+      excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` if None.
     """
 
     task: str
@@ -90,7 +90,7 @@ class Row:
     excess: np.ndarray | None = None
 
     def score(self, column: str) -> np.ndarray:
-        """[seeds] of a column, nan where the row does not have it."""
+        """[seeds] of a column, nan if the row does not have it."""
         nothing = np.full(len(next(iter(self.scores.values()), [0])), np.nan)
         return self.scores.get(column, nothing)
 
@@ -151,7 +151,7 @@ def _row(group: Group) -> Row:
 
 
 def shown(rows: Sequence[Row]) -> list[Column]:
-    """The columns that any row has, in order; true costs only where a run did not feel all of them."""
+    """The columns that any row has, in order; true costs only if a run did not feel all of them."""
     every = columns(row.task for row in rows)
     present = [column for column in every if any(column.name in row.scores for row in rows)]
     felt = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)

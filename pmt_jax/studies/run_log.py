@@ -68,7 +68,7 @@ class RunLog:
     def final(self, name: str) -> np.ndarray | None:
         """[S] means of a metric over the last tenth of the steps, nan for a seed that broke; None if unknown.
 
-        Where evaluations were made there, they count and not the training episodes.
+        If evaluations were made there, they replace the training episodes.
         """
         source = f"eval/{name}" if self.evaluated else name
         if source not in self.metrics:
@@ -89,7 +89,7 @@ class RunLog:
     def excess(self) -> np.ndarray:
         """[S] how far each seed's cost at the end (see `final`) is beyond the limit; of several costs the worst.
 
-        Where not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs.
+        If not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs.
         """
         several = sum(name.startswith("cost_limit/") for name in self.metrics)
         if several:
@@ -136,7 +136,7 @@ def _averaged(values: np.ndarray, starts: list[int]) -> np.ndarray:
 
 
 def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[RunLog]:
-    """The runs among and below `paths`; what holds none is left out with a note.
+    """The runs among and below `paths`; other folders are left out with a note.
 
     Raises:
       UsageError: a path does not exist, none of them holds a run with metrics, or a run cannot be read.
@@ -179,9 +179,9 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def read(folder: pathlib.Path) -> RunLog | None:
-    """The run in `folder`; None where it has no metrics yet.
+    """The run in `folder`; None if it has no metrics yet.
 
-    Lines cut off in the middle are left out; where a step stands twice, the later line counts.
+    Lines cut off in the middle are left out; if a step occurs twice, the later line counts.
 
     Raises:
       UsageError: settings or metrics that cannot be read, or are of the wrong type.
@@ -212,7 +212,7 @@ def read(folder: pathlib.Path) -> RunLog | None:
 
 
 def _check(row: dict[str, Any], file: pathlib.Path) -> None:
-    """Raises UsageError where a row's identity is missing or of the wrong type."""
+    """Raises UsageError if a row's identity is missing or of the wrong type."""
     for name, kind in IDENTITY.items():
         value = row.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float if kind is float else kind):
@@ -242,7 +242,7 @@ def _metrics(
 
 
 def _changes(folder: pathlib.Path) -> dict[str, str]:
-    """Which settings changed after which step (--change), as one more setting; {} where none did."""
+    """Which settings changed after which step (--change), as one more setting; {} if none did."""
     rows = read_rows(folder / "changes.jsonl")
     told = [f"{name} {x} at {row['step']:,}" for row in rows for name, x in row["changed"].items()]
     return {"changed": "; ".join(told)} if told else {}
@@ -310,7 +310,7 @@ class Group:
         return tuple(seed for run in self.runs for seed in run.seeds)
 
     def score(self, name: str, throughout: bool = False) -> np.ndarray | None:
-        """[S] a metric's means over the last tenth of each run's steps, or all; None where a run does not know it."""
+        """[S] a metric's means over the last tenth of each run's steps, or all; None if a run does not have it."""
         found = [run.throughout(name) if throughout else run.final(name) for run in self.runs]
         known = [x for x in found if x is not None]
         return np.concatenate(known) if len(known) == len(found) else None
@@ -320,7 +320,8 @@ def groups(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
     """Pools runs that are the same up to seeds, in the order given.
 
     Args:
-      note: told of a run whose seeds a longer one has too, which is then left out; where None, this is an error.
+      note: called with a sentence for a run whose seeds a longer one has too, which is then left out; if None, this
+        is an error.
 
     Raises:
       UsageError: a seed counts twice.

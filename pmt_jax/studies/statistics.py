@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 LEVEL = 0.95
 DRAWS = 100_000  # of normal samples, for the IQM's quantile
 
-Interval = tuple[float, float]  # (low, high), nan where one score says nothing of the spread
+Interval = tuple[float, float]  # (low, high), nan if there is one score only
 Strata = Sequence[ArrayLike]  # one [seeds] per task; tasks may have different numbers of seeds
 
 

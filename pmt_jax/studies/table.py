@@ -70,7 +70,7 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
       than the baseline, with which `p`, and the `paper`'s numbers.
 
     Raises:
-      UsageError: no row, or several of one task, are called like the baseline.
+      UsageError: no row, or several of one task, have the baseline's name.
     """
     numbers = paper()["tasks"]
     comparisons = compare.with_baseline(table, baseline) if baseline else {}

@@ -31,7 +31,7 @@ _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 def pack(tree: Any) -> dict[str, np.ndarray]:
     """A pytree as {path: array}; typed keys become their numbers, empty leaves are left out.
 
-    Where the arrays lie in several processes, all of them must call it.
+    If the arrays lie in several processes, all of them must call it.
     """
     leaves = {jax.tree_util.keystr(path): x for path, x in jax.tree_util.tree_leaves_with_path(tree)}
     plain = sharding.gather({path: jax.random.key_data(x) if _is_key(x) else x for path, x in leaves.items()})
@@ -79,7 +79,7 @@ def _to_bytes(table: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
-    """The inverse of `_to_bytes`; a ValueError where the checksum does not fit."""
+    """The inverse of `_to_bytes`; a ValueError if the checksum does not fit."""
     data, checksum = array[:-4].tobytes(), array[-4:].tobytes()
     if zlib.crc32(data).to_bytes(4) != checksum:
         raise ValueError("its checksum does not fit")
@@ -102,7 +102,7 @@ class Checkpoints:
     def _open(self, read_only: bool) -> None:
         several = jax.process_count() > 1
         if several and not read_only:
-            self._folder.mkdir(parents=True, exist_ok=True)  # orbax does not where it is to be used by one alone
+            self._folder.mkdir(parents=True, exist_ok=True)  # orbax does not if one process uses it alone
         with _quiet():
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=KEEP,

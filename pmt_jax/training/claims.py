@@ -26,7 +26,7 @@ _held: dict[pathlib.Path, tuple[int, bool]] = {}  # descriptor, and whether an e
 def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
     """Keeps other processes out of `folder` until the end of the block.
 
-    A folder that is not there is made. Made here, or `created` for this, it is removed where it stays empty.
+    A folder that is not there is made. Made here, or `created` for this, it is removed if it stays empty.
 
     Raises:
       UsageError: another process has claimed it, or it cannot be written.
@@ -68,7 +68,7 @@ def _release(path: pathlib.Path) -> None:
 
 
 def _open(path: pathlib.Path) -> tuple[int, bool]:
-    """The descriptor of the claim file, and whether it is locked; UsageError where another process has the lock."""
+    """The descriptor of the claim file, and whether it is locked; UsageError if another process has the lock."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -86,7 +86,7 @@ def _open(path: pathlib.Path) -> tuple[int, bool]:
 
 
 def _read(file: int) -> dict[str, Any]:
-    """Who claimed the folder: pid, host, since; empty where the file is."""
+    """Who claimed the folder: pid, host, since; empty if the file is."""
     try:
         owner = json.loads(os.pread(file, 4096, 0))
     except ValueError:

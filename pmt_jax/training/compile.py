@@ -34,7 +34,7 @@ class Programs(NamedTuple):
 
     Attributes:
       chunk: state -> the state `log_interval` updates later, and metrics [seeds, updates], with those of `_health`.
-      evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None where the run never asks.
+      evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
     """
 

@@ -38,7 +38,7 @@ def check(setup: Setup) -> None:
 
 
 def _device_memory() -> float:
-    """Bytes of one device, or of the machine where devices share its memory."""
+    """Bytes of one device, or of the machine if devices share its memory."""
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in stats or not hasattr(os, "sysconf"):  # Windows has none
         return stats.get("bytes_limit", math.inf)

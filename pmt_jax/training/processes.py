@@ -55,7 +55,7 @@ def join(coordinator: str | None, process: int | None, processes: int | None) ->
 
 
 def make_room(several: bool = False) -> None:
-    """Sets more threads than cores for XLA's CPU devices, where they are several or in `several` processes.
+    """Sets more threads than cores for XLA's CPU devices, if they are several or in `several` processes.
 
     A collective holds a thread of the pool until all devices have reached it, and devices reach theirs in any order:
     with no more threads than devices they may deadlock, and XLA ends the process after 40 s. It must be called before

@@ -34,7 +34,7 @@ MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
 
 def create(setup: Setup) -> pathlib.Path:
-    """A new folder runs/TASK-METHOD-TIME, with a number behind it where another run has taken the name."""
+    """A new folder runs/TASK-METHOD-TIME, with a number behind it if another run has taken the name."""
     task = re.sub(r"[^\w.+-]+", "-", setup.vector.spec.name).strip(".-") or "task"
     name = f"{task}-{setup.config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
@@ -137,7 +137,7 @@ def write_settings(out: pathlib.Path, setup: Setup) -> None:
 def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
     """Drops the rows after the checkpoint that the run continues from, and a line that was cut off.
 
-    Where there is no checkpoint, all rows are kept under another name.
+    If there is no checkpoint, all rows are kept under another name.
 
     Returns:
       the rows up to `step`.

@@ -59,7 +59,7 @@ def train(
       loggers: where the rows are written besides metrics.jsonl: csv, tensorboard, wandb.
       profile: a folder for a JAX profiler trace of a few chunks.
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
-      count: of devices to split the run over, of all processes together: one where None, or all of several processes'.
+      count: of devices to split the run over, of all processes together: one if None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
@@ -279,7 +279,7 @@ class Trainer:
                 self.broken[i] = reason
 
     def _evaluate(self, rows: list[Row]) -> None:
-        """Adds the columns of an evaluation, nan where none is due."""
+        """Adds the columns of an evaluation, nan if none is due."""
         if self.programs.evaluate is None:
             return
         updates = self.step // self.config.batch_size

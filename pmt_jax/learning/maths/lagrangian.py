@@ -23,7 +23,7 @@ def held_limit(cost_limit: jax.Array | float | tuple[float, ...], cost_margin: j
 def in_limits(excess: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
     """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
 
-    It asks for the same answer at every limit, and a cost far beyond one does not outrun the policy.
+    An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit.
     """
     return jnp.clip(excess * horizon / jnp.maximum(cost_limit, 1e-6), -1.0, 1.0)
 
@@ -63,8 +63,8 @@ def lowered_limit(
 ) -> jax.Array:
     """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
 
-    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where the
-    step already does nothing but lower the cost, a limit lowered further would only have to be raised again later.
+    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. If
+    the step already does nothing but lower the cost, the limit is not lowered further: it would have to rise again.
     Nor is it lowered by more than the cost itself: what adds up while a policy is far beyond the limit would keep it in
     recovery for good.
 
