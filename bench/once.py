@@ -154,8 +154,8 @@ def data_rows(task: str, episodes: int) -> np.ndarray:
         after, outcome = vector.step(state, still)
         return after, (state.env.carry.row, outcome.terminated)
 
-    key = jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon)  # as `play` has it
-    rows, ended = jax.jit(lambda: jax.lax.scan(step, vector.reset(key), length=vector.horizon)[1])()
+    start = vector.reset(jax.random.fold_in(jax.random.key(EVALUATION_KEY), vector.horizon))  # as `play` has it
+    rows, ended = jax.jit(lambda: jax.lax.scan(step, start, length=vector.horizon)[1])()
     if ended.any():
         raise RuntimeError("without reactive power a power flow has no solution: the episode's later rows are unknown")
     return np.asarray(rows, np.float64)
