@@ -88,6 +88,7 @@ class Networks:
     cost_critic: MLP
     fear_net: MLP
     regret_net: MLP
+    regret_inputs: int
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -129,8 +130,7 @@ class Networks:
     def init_regret(self, key: jax.Array) -> Params:
         """Weights with a leading [num_agents]."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_agents))
-        action_dim = self.actor.trunk.outputs
-        return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.state_dim + action_dim)))(keys)
+        return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.regret_inputs)))(keys)
 
     def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
@@ -174,7 +174,10 @@ class Networks:
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
     def regret(self, params: Params, state: jax.Array, action: jax.Array) -> jax.Array:
-        """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
+        """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A].
+
+        With the response `counterfactual`, those of danger: state [..., S], joint action [..., N A] -> [..., K].
+        """
         return _apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
 
@@ -190,6 +193,7 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         input_norm = config.obs_norm == "layernorm"
         return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
 
+    counterfactual = config.regret_response == "counterfactual"
     return Networks(
         num_actors=1 if share_actor else spec.num_agents,
         num_agents=spec.num_agents,
@@ -200,5 +204,6 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
         fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
-        regret_net=mlp(spec.action_dim, 0.01),
+        regret_net=mlp(spec.num_costs if counterfactual else spec.action_dim, 0.01),
+        regret_inputs=spec.state_dim + spec.action_dim * (spec.num_agents if counterfactual else 1),
     )

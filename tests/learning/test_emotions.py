@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import pathlib
 import re
 
@@ -13,8 +14,12 @@ import optax
 import pytest
 
 import pmt_jax
+from pmt_jax import load_config, make_setup
 from pmt_jax.learning import emotions
 from pmt_jax.learning.emotions import regret_weight
+from pmt_jax.learning.optimise import init_train_state
+from pmt_jax.learning.types import Batch, TrainState
+from small import SMALL
 
 TOP = {"choose": "top", "regret_max": 0.9}
 
@@ -188,3 +193,38 @@ def test_every_equation_is_one_function(number: int):
                     if str(number) in numbers.split(", "):
                         named.append(f"{path.name}:{node.name}")
     assert len(named) == 1, named
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Regret about the action not taken
+
+
+def two_actions(likely: tuple[float, float]) -> np.ndarray:
+    """Mean regret [2, 2] of both agents where agent 0's action was below and above 0, which cost as `likely` says."""
+    setup = make_setup(load_config("switch", method="r4sg", regret_response="counterfactual", **SMALL))
+    hyper = dataclasses.replace(setup.hyper, gamma=jnp.float32(0), emotion_lr=jnp.float32(1e-2))
+    key, shape = jax.random.key(0), (40, 64, 2)
+    action = jax.random.normal(key, (*shape, 2))
+    above = (action[..., 0, 0] > 0).astype(int)
+    cost = jnp.broadcast_to(jnp.asarray(likely)[above][..., None, None], (*shape, 1))
+    known = {"state": jnp.zeros((*shape[:2], setup.vector.spec.state_dim)), "action": action, "cost": cost}
+    known |= {"mean": jnp.zeros_like(action), "std": jnp.ones_like(action), "log_prob": jnp.zeros(shape)}
+    batch = Batch(**dict.fromkeys((field.name for field in dataclasses.fields(Batch)), jnp.zeros(())) | known)
+
+    def appraise(net: TrainState, _: object) -> tuple[TrainState, jax.Array]:
+        net, regret, _ = emotions.appraise_actions(setup, hyper, net, batch, cost, key)
+        return net, regret[..., 0]
+
+    start = jax.vmap(init_train_state)(setup.nets.init_regret(key))
+    _, regret = jax.jit(lambda net: jax.lax.scan(appraise, net, length=40))(start)
+    return np.stack([regret[-1][above == x].mean(0) for x in (0, 1)], axis=1)
+
+
+def test_an_action_is_regretted_where_the_alternative_was_safe():
+    mine, others = two_actions((0.0, 0.8))
+    np.testing.assert_allclose(mine, [-0.4, 0.4], atol=0.06)  # of the alternatives, half cost
+    np.testing.assert_allclose(others, 0, atol=0.06)  # whatever agent 1 had done, the danger is agent 0's
+
+
+def test_nothing_is_regretted_where_all_actions_are_alike():
+    np.testing.assert_allclose(two_actions((0.4, 0.4)), 0, atol=0.02)
