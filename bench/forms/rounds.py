@@ -226,6 +226,11 @@ def as_responses(file: pathlib.Path) -> str:
     return beside([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
 
 
+def as_action(file: pathlib.Path) -> str:
+    """Question c, the last response: R4SG by the letter and with regret about the action not taken, beside MAPPO-L."""
+    return beside([_first(runs.load(file), method="mappo_l")])
+
+
 def as_prior(file: pathlib.Path) -> str:
     """Question d: F4SG with the fear of another task from the first step on, beside F4SG that starts afresh."""
     return beside([_prior_last(file)])
@@ -309,6 +314,7 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "candidate_d": as_candidate_d,
     "fourth": as_fourth,
     "power": as_power,
+    "action": as_action,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
 }

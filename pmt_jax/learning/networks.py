@@ -76,6 +76,7 @@ class Networks:
     Attributes:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
+      regret_inputs: entries that an agent's regret network sees.
     """
 
     num_actors: int

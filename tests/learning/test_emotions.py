@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import pathlib
 import re
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -199,32 +201,37 @@ def test_every_equation_is_one_function(number: int):
 # Regret about the action not taken
 
 
-def two_actions(likely: tuple[float, float]) -> np.ndarray:
-    """Mean regret [2, 2] of both agents where agent 0's action was below and above 0, which cost as `likely` says."""
+@functools.cache
+def regretted() -> tuple[np.ndarray, Callable[[jax.Array], jax.Array]]:
+    """Where agent 0's action was above 0 [T, B], and costs [T, B, 2, 1] -> learned regret of both agents [T, B, 2]."""
     setup = make_setup(load_config("switch", method="r4sg", regret_response="counterfactual", **SMALL))
     hyper = dataclasses.replace(setup.hyper, gamma=jnp.float32(0), emotion_lr=jnp.float32(1e-2))
-    key, shape = jax.random.key(0), (40, 64, 2)
+    key, shape = jax.random.key(0), (40, 16, 2)
     action = jax.random.normal(key, (*shape, 2))
-    above = (action[..., 0, 0] > 0).astype(int)
-    cost = jnp.broadcast_to(jnp.asarray(likely)[above][..., None, None], (*shape, 1))
-    known = {"state": jnp.zeros((*shape[:2], setup.vector.spec.state_dim)), "action": action, "cost": cost}
+    known = {"state": jnp.zeros((*shape[:2], setup.vector.spec.state_dim)), "action": action}
     known |= {"mean": jnp.zeros_like(action), "std": jnp.ones_like(action), "log_prob": jnp.zeros(shape)}
-    batch = Batch(**dict.fromkeys((field.name for field in dataclasses.fields(Batch)), jnp.zeros(())) | known)
+    empty = dict.fromkeys((field.name for field in dataclasses.fields(Batch)), jnp.zeros(()))
 
-    def appraise(net: TrainState, _: object) -> tuple[TrainState, jax.Array]:
-        net, regret, _ = emotions.appraise_actions(setup, hyper, net, batch, cost, key)
-        return net, regret[..., 0]
+    def regret(cost: jax.Array) -> jax.Array:
+        def appraise(net: TrainState, _: object) -> tuple[TrainState, jax.Array]:
+            batch = Batch(**empty | known | {"cost": cost})
+            net, regret, _ = emotions.appraise_actions(setup, hyper, net, batch, cost, key)
+            return net, regret[..., 0]
 
-    start = jax.vmap(init_train_state)(setup.nets.init_regret(key))
-    _, regret = jax.jit(lambda net: jax.lax.scan(appraise, net, length=40))(start)
-    return np.stack([regret[-1][above == x].mean(0) for x in (0, 1)], axis=1)
+        start = jax.vmap(init_train_state)(setup.nets.init_regret(key))
+        return jax.lax.scan(appraise, start, length=60)[1][-1]
+
+    return np.asarray(action[..., 0, 0] > 0), jax.jit(regret)
 
 
 def test_an_action_is_regretted_where_the_alternative_was_safe():
-    mine, others = two_actions((0.0, 0.8))
-    np.testing.assert_allclose(mine, [-0.4, 0.4], atol=0.06)  # of the alternatives, half cost
-    np.testing.assert_allclose(others, 0, atol=0.06)  # whatever agent 1 had done, the danger is agent 0's
+    above, regret = regretted()
+    cost = jnp.broadcast_to(jnp.where(above, 0.8, 0.0)[..., None, None], (*above.shape, 2, 1))
+    mine, others = np.moveaxis(np.asarray(regret(cost)), -1, 0)
+    np.testing.assert_allclose([mine[~above].mean(), mine[above].mean()], [-0.4, 0.4], atol=0.06)  # half of all cost
+    np.testing.assert_allclose([others[~above].mean(), others[above].mean()], 0, atol=0.06)  # it is agent 0's danger
 
 
 def test_nothing_is_regretted_where_all_actions_are_alike():
-    np.testing.assert_allclose(two_actions((0.4, 0.4)), 0, atol=0.02)
+    above, regret = regretted()
+    np.testing.assert_allclose(regret(jnp.full((*above.shape, 2, 1), 0.4)), 0, atol=0.02)
