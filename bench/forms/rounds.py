@@ -226,11 +226,6 @@ def as_responses(file: pathlib.Path) -> str:
     return beside([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
 
 
-def as_action(file: pathlib.Path) -> str:
-    """Question c, the last response: R4SG by the letter and with regret about the action not taken, beside MAPPO-L."""
-    return beside([_first(runs.load(file), method="mappo_l")])
-
-
 def as_prior(file: pathlib.Path) -> str:
     """Question d: F4SG with the fear of another task from the first step on, beside F4SG that starts afresh."""
     return beside([_prior_last(file)])
@@ -246,6 +241,11 @@ def as_prior_in_time(file: pathlib.Path) -> str:
         body.append([name, "fear of a step felt as costly", *(f"{x:.2f}" for x in fear)])
         body.append([name, "true cost per 1,000 steps", *(f"{x:.0f}" for x in cost)])
     return markdown(["method", "mean", *(f"to {x / 1e6:.1f} M" for x in run["steps"])], body)
+
+
+def as_action(file: pathlib.Path) -> str:
+    """Question c, the last response: R4SG by the letter and with regret about the action not taken, beside MAPPO-L."""
+    return beside([_first(runs.load(file), method="mappo_l")])
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
@@ -314,7 +314,7 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "candidate_d": as_candidate_d,
     "fourth": as_fourth,
     "power": as_power,
-    "action": as_action,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
+    "action": as_action,
 }
