@@ -27,7 +27,7 @@ class Case:
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
-      processes: that share the seeds of a training and the CPUs and do not communicate.
+      jobs: worker processes that share the seeds of a training and the CPUs; cases with more jobs than CPUs are left out.
       settings: other settings of the training; alone, other options of the environment.
     """
 
@@ -42,7 +42,7 @@ class Case:
     rollout_length: int = 0
     devices: int = 1
     threads: int = 0
-    processes: int = 1
+    jobs: int = 1
     settings: Settings = ()
 
     def about(self) -> dict[str, Any]:
@@ -110,8 +110,8 @@ def _plain(task: str) -> tuple[Case, ...]:
     return Case("plain loop", task, threads=1), Case("plain loop", task)
 
 
-def _in_processes(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
-    return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), processes=count) for count in counts)
+def _in_jobs(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
+    return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), jobs=count) for count in counts)
 
 
 def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tuple[Case, ...]:
@@ -157,16 +157,20 @@ BENCHES = {
         ),
     ),
     "workstation": Bench(
-        "ant: control steps/s of plain loops, the environment and training, one seed, and 8 and 16 in processes",
+        "ant: control steps/s of plain loops, the environment and training, one seed, and 8 and 16 in worker processes",
         (
             *_plain("ant_2x4")[1:],
             *_alone("ant_2x4", (64, 256), physics="mujoco"),
             _training("ant_2x4", "mappo_l", 1, 256, 32),
             _training("ant_2x4", "mappo_l", 1, 64, 64),
-            *_in_processes("ant_2x4", 8, (1, 2, 4, 8)),
-            *_in_processes("ant_2x4", 16, (1, 16)),
+            *_in_jobs("ant_2x4", 8, (1, 2, 4, 8)),
+            *_in_jobs("ant_2x4", 16, (1, 4, 8, 16)),
         ),
-        _in_processes("ant_2x4", 2, (1, 2)),
+        (
+            *_plain("ant_2x4")[1:],
+            *_in_jobs("ant_2x4", 2, (1, 2)),
+            *(case for seeds in (8, 16) for case in _in_jobs("ant_2x4", seeds, (1, seeds))),
+        ),
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",

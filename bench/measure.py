@@ -10,9 +10,6 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
-import functools
-import multiprocessing
-import os
 import statistics
 import subprocess
 import time
@@ -24,10 +21,11 @@ import jax.numpy as jnp
 import psutil
 
 import envs
+from envs.physics import usable_cpus
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
+from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
-from pmt_jax.training.run_folder import MATMUL_PRECISION
 
 from . import grid, once, plain
 from .cases import Bench, Build, Case, Program
@@ -55,7 +53,8 @@ def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str
         await_quiet(6 * effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
-    timed = [case for case in cases if case.kind not in ONCE and case.devices <= jax.device_count()]
+    fits = [case for case in cases if case.devices <= jax.device_count() and case.jobs <= max(2, usable_cpus())]
+    timed = [case for case in fits if case.kind not in ONCE]
     for group in [timed] if bench.by_turns else [[case] for case in timed]:
         programs = _compiled(group, failed, bench.on == "gpus", say)
         turns = _take_turns(programs, effort)
@@ -145,19 +144,17 @@ def environment(case: Case) -> Build:
 
 def training(case: Case) -> Build:
     """The training loop as `pmt train` compiles it; a call is one update, on a GPU eight."""
-    if case.processes > 1:
-        return functools.partial(_in_processes, case)
     updates = UPDATES["cpu" if jax.devices()[0].platform == "cpu" else "gpu"]
     steps = updates * case.num_envs * case.rollout_length
     sizes = {"seeds": case.seeds, "num_envs": case.num_envs, "rollout_length": case.rollout_length}
     engine = {"physics": case.physics} if case.physics else {}
     settings = sizes | engine | {"log_interval": updates, "steps": steps}
     setup = make_setup(load_config(case.task, method=case.method, **settings, **dict(case.settings)))
-    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices))
+    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), jobs=case.jobs)
 
     def build() -> Program:
         begin = time.perf_counter()
-        state, programs = compile_run(setup, lambda _: None)
+        state, programs = (jobs.start if case.jobs > 1 else compile_run)(setup, lambda _: None)
         facts = {"physics": setup.vector.env.engine, "compile_seconds": round(time.perf_counter() - begin, 2)}
         box = [state]
 
@@ -167,40 +164,6 @@ def training(case: Case) -> Build:
         return Program(call, case.seeds * steps, facts)
 
     return build
-
-
-def _in_processes(case: Case) -> Program:
-    """Each process trains its part of the seeds on its part of the CPUs; a call waits for one update of all."""
-    spawn, cpus, count = multiprocessing.get_context("spawn"), sorted(os.sched_getaffinity(0)), case.processes
-    part = dataclasses.replace(case, seeds=case.seeds // count, processes=1)
-    pipes = []
-    for i in range(count):
-        ours, theirs = spawn.Pipe()
-        mine = cpus[i * len(cpus) // count : (i + 1) * len(cpus) // count] or [cpus[i % len(cpus)]]
-        spawn.Process(target=_serve, args=(part, mine, theirs), daemon=True).start()
-        theirs.close()  # the process's end alone is left: where it dies, reading ends
-        pipes.append(ours)
-
-    def call() -> list[Any]:
-        for pipe in pipes:
-            pipe.send(None)
-        return [pipe.recv() for pipe in pipes]
-
-    steps = [pipe.recv() for pipe in pipes]  # once compiled
-    return Program(call, sum(steps))
-
-
-def _serve(case: Case, cpus: list[int], pipe: Any) -> None:
-    """A process of `_in_processes`: compiles, then does the program's work whenever it is told."""
-    os.sched_setaffinity(0, cpus)
-    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
-    program = training(case)()
-    pipe.send(program.steps)
-    with contextlib.suppress(EOFError):
-        while True:
-            pipe.recv()
-            program.call()
-            pipe.send(None)
 
 
 ONCE = {

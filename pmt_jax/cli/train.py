@@ -48,6 +48,9 @@ def add(commands: Any) -> None:
     add_cache(output)
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
+    hosts.add_argument(
+        "--jobs", type=whole(1), default=1, metavar="N", help="worker processes that share seeds and CPUs (default 1)"
+    )
     hosts.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process listens")
     hosts.add_argument("--process", type=whole(0), metavar="I", help="which process this is, from 0")
     hosts.add_argument("--processes", type=whole(1), metavar="N", help="how many there are")
@@ -76,6 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         profile=arguments.profile,
         say=say,
         count=arguments.devices,
+        workers=arguments.jobs,
         warm_start=warm_start.prepare,
         debug=arguments.debug,
         change=arguments.change,

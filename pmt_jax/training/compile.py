@@ -1,4 +1,4 @@
-"""The persistent compile cache, and the programs of a run."""
+"""The persistent compile cache, the programs of a run, and whether they fit into memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import itertools
+import math
 import os
 import pathlib
 import time
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
+from ..errors import UsageError
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
 from ..learning.maths import running_moments
@@ -25,6 +27,7 @@ from ..learning.setup import Setup
 from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 from ..output import Say
 
+FLOAT = 4  # bytes
 KERNEL_LINES = 5.0  # seconds between two of them
 KERNEL_THREADS = max(1, min(8, (os.cpu_count() or 1) - 1))  # one CPU is XLA's; Warp writes one source at a time
 
@@ -34,13 +37,17 @@ class Programs(NamedTuple):
 
     Attributes:
       chunk: state -> the state `log_interval` updates later, and metrics [seeds, updates], with those of `_health`.
-      evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
+      evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
+      measures: the names of these metrics.
+      close: ends what runs beside this process for them.
     """
 
     chunk: Callable[[LearnerState], tuple[LearnerState, Metrics]]
-    evaluate: jax.stages.Compiled | None
     take: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
+    evaluate: Callable[[LearnerState], Metrics] | None = None
+    measures: tuple[str, ...] = ()
+    close: Callable[[], object] = lambda: None
 
 
 def cache_folder() -> pathlib.Path:
@@ -56,6 +63,37 @@ def use_cache() -> None:
     if not getattr(jax.config, "jax_compilation_cache_dir", None):
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def check_memory(setup: Setup) -> None:
+    """Refuses a run that cannot fit: observations of one batch, or weights and Adam's moments, exceed the memory.
+
+    Raises:
+      UsageError: names what is too large.
+    """
+    config, spec = setup.config, setup.vector.spec
+    memory = _device_memory() * (setup.mesh.size if setup.mesh else 1)
+    batch = config.batch_size * (spec.num_agents * spec.obs_dim + spec.state_dim)
+    widths = (spec.obs_dim, *config.hidden, spec.action_dim)
+    networks = 3 * spec.num_agents * sum(x * y for x, y in itertools.pairwise(widths))
+    for what, floats in (
+        (f"a batch of num_envs * rollout_length = {config.num_envs} * {config.rollout_length} steps", batch),
+        (f"networks with hidden = {list(config.hidden)}", networks),
+    ):
+        needed = config.seeds * floats * FLOAT
+        if needed > memory:
+            raise UsageError(
+                f"{what} needs at least {needed / 1e9:,.0f} GB for {config.seeds} seed(s), but there are "
+                f"{memory / 1e9:,.0f} GB here; ask for less"
+            )
+
+
+def _device_memory() -> float:
+    """Bytes of one device, or of the machine if devices share its memory."""
+    stats = jax.local_devices()[0].memory_stats() or {}
+    if "bytes_limit" in stats or not hasattr(os, "sysconf"):  # Windows has none
+        return stats.get("bytes_limit", math.inf)
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 @contextlib.contextmanager
@@ -103,14 +141,15 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     program = jax.jit(_over_seeds(setup, chunk, axes), out_shardings=(placement, everywhere))
     with sharding.use_mesh(setup.mesh), cache_events() as events:
         compiled = debug.checked(program) if setup.debug else program.lower(hyper, state).compile()
-    evaluation = None
+    programs = Programs(functools.partial(compiled, hyper), jax.jit(take, donate_argnums=1))
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
         with sharding.use_mesh(setup.mesh):
             evaluation = program.lower(state).compile()
+        programs = programs._replace(evaluate=evaluation, measures=tuple(evaluation.out_info))
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
-    return state, Programs(functools.partial(compiled, hyper), evaluation, jax.jit(_take, donate_argnums=1)), found
+    return state, programs, found
 
 
 def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
@@ -180,5 +219,6 @@ def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callab
     return jax.vmap(function, axes, axis_name=axis_name, spmd_axis_name=sharding.SEED if setup.mesh else None)
 
 
-def _take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
+def take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
+    """See `Programs`."""
     return jax.vmap(lambda yes, x, y: jax.tree.map(functools.partial(jnp.where, yes), y, x))(chosen, old, new)

@@ -9,7 +9,7 @@ import os
 import pickle
 import socket
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
@@ -78,9 +78,13 @@ def _share_cpus() -> None:
     cpus = sorted(os.sched_getaffinity(0))
     place = zlib.crc32(f"{socket.gethostname()} {cpus}".encode())
     together = np.flatnonzero(multihost_utils.process_allgather(np.uint32(place)) == place).tolist()
-    rank, parts = together.index(jax.process_index()), len(together)
+    take_cpus(0, cpus, together.index(jax.process_index()), len(together))
+
+
+def take_cpus(process: int, cpus: Sequence[int], rank: int, parts: int) -> None:
+    """Gives `process` (0: this one), before it starts threads, its part of `cpus`; with too few, some share one."""
     mine = cpus[rank * len(cpus) // parts : (rank + 1) * len(cpus) // parts]
-    os.sched_setaffinity(0, mine or [cpus[rank % len(cpus)]])
+    os.sched_setaffinity(process, mine or [cpus[rank % len(cpus)]])
 
 
 def is_first() -> bool:

@@ -124,7 +124,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     """What the results of a run depend on besides its settings."""
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
-    found |= {"devices": setup.mesh.size if setup.mesh else 1}
+    found |= {"devices": setup.mesh.size if setup.mesh else 1, "jobs": setup.jobs}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
 
 
@@ -174,6 +174,12 @@ def _check_number(metrics: pathlib.Path, row: Row, name: str) -> None:
         )
 
 
+def state_like(setup: Setup) -> LearnerState:
+    """Shapes and dtypes of the run's state, with a leading [seeds]."""
+    keys = jax.vmap(jax.random.key)(jnp.arange(setup.config.seeds))
+    return jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), (None, 0)), setup.hyper, keys)
+
+
 def initial_best(state: LearnerState) -> Best:
     """Before anything is known of a run of any number of seeds."""
     nothing = np.full(state.update.shape, np.inf, np.float32)
@@ -194,8 +200,7 @@ def load_saved(
         raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
-    keys = jax.vmap(jax.random.key)(jnp.arange(config.seeds))
-    like = jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), (None, 0)), setup.hyper, keys)
+    like = state_like(setup)
     checkpoints = Checkpoints(folder, read_only=True)
     try:
         step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)

@@ -22,9 +22,9 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import claims, health, memory, processes, run_folder
+from . import claims, health, jobs, processes, run_folder
 from .checkpoint import Checkpoints
-from .compile import Programs, compile_run, use_cache
+from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Logger, Profile, check_loggers, open_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, duration
@@ -46,6 +46,7 @@ def train(
     say: Say = say,
     trials: Trials | None = None,
     count: int | None = None,
+    workers: int = 1,
     warm_start: WarmStart = lambda setup: None,
     debug: bool = False,
     change: bool = False,
@@ -61,6 +62,7 @@ def train(
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
       count: of devices to split the run over, of all processes together: one if None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
+      workers: processes that share the seeds and the CPUs (see jobs.py).
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
@@ -74,19 +76,21 @@ def train(
     """
     jax.config.update("jax_default_matmul_precision", run_folder.MATMUL_PRECISION)
     check_loggers(loggers)
+    jobs.check(config, workers, {"--devices": count, "--debug": debug, "--profile": profile})
     if not processes.is_first():
         say, loggers, profile = silent, (), None
     if profile is not None:
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
-        setup = _make_setup(config, trials, count, debug)
+        setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
         begin = None if resume else warm_start(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say, change))
         _describe(setup, out, say)
         if cache:
             use_cache()
-        state, programs = compile_run(setup, say)
+        state, programs = (jobs.start if workers > 1 else compile_run)(setup, say)
+        stack.callback(programs.close)
         trainer = Trainer(setup, programs, begin(state) if begin else state, out, say)
         return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
 
@@ -101,7 +105,7 @@ def _make_setup(config: Config, trials: Trials | None, count: int | None, debug:
     if debug and mesh:
         raise UsageError("--debug runs on one device in one process; leave out --devices")
     setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
-    memory.check(setup)
+    check_memory(setup)
     return setup
 
 
@@ -113,6 +117,9 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
         stack.close()
     except NotFinite as found:
         trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
+        return 1
+    except jobs.Lost as lost:
+        trainer.say(f"stopped: {lost}; saved as of step {trainer.step:,}. Continue with: {trainer.command}")
         return 1
     except OSError as error:
         with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
@@ -147,6 +154,8 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
             f"{setup.mesh.size} devices in {jax.process_count()} process(es): seeds in {seeds} part(s), "
             f"each seed's environments in {environments}"
         )
+    if setup.jobs > 1:
+        say(f"{setup.jobs} worker processes share the seeds and the CPUs")
     say(
         f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
         f"{config.num_updates:,} updates = {steps:,} steps a seed"
@@ -228,12 +237,14 @@ class Trainer:
         interrupts.save_first()
         while self.step < self.total and not self.all_broken and not self._agree_to_stop(interrupts):
             self._profile.before_chunk()
+            before_chunk = self.state, self.step
             try:
                 rows = self._train_chunk()
-            except NotFinite:
+                self._evaluate(rows)
+            except (NotFinite, jobs.Lost):
+                self.state, self.step = before_chunk
                 self._save()
                 raise
-            self._evaluate(rows)
             self.seconds = before + time.monotonic() - begin
             self._log(rows)
             self._keep_best(rows)
@@ -284,7 +295,7 @@ class Trainer:
             return
         updates = self.step // self.config.batch_size
         due = updates % self.config.eval_interval < self.config.log_interval and not self.all_broken
-        nothing = dict.fromkeys(self.programs.evaluate.out_info, (math.nan, math.nan))
+        nothing = dict.fromkeys(self.programs.measures, (math.nan, math.nan))
         results = seed_intervals(jax.device_get(self.programs.evaluate(self.state))) if due else [nothing] * len(rows)
         for i, (row, result) in enumerate(zip(rows, results, strict=True)):
             row |= evaluation_columns(nothing if i in self.broken else result)
@@ -323,7 +334,7 @@ class Trainer:
         """Prints how training ended and what to do next; returns the exit code."""
         self._list_broken()
         if self.step < self.total and not self.all_broken:
-            self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self._command}")
+            self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self.command}")
             return 128 + self._signal
         if not self.all_broken:
             next_step = "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.out)])}"
@@ -346,17 +357,18 @@ class Trainer:
     def write_failure(self, error: OSError) -> str:
         """What to do about a full disk, a quota, or a share that is gone."""
         begun = (self.out / "config.toml").is_file()
-        then = f"continue: {self._command}" if begun else "train again into another --out"
+        then = f"continue: {self.command}" if begun else "train again into another --out"
         why = error.strerror or error
         return f"stopped: cannot write into {self.out}: {why}. What was saved is whole; make room and {then}"
 
     @property
-    def _command(self) -> str:
+    def command(self) -> str:
         """What continues the run."""
         if self.setup.trials:
             return "the same command"
         if jax.process_count() > 1:
             return "the same command with --resume"
         split = f" --devices {self.setup.mesh.size}" if self.setup.mesh else ""
+        split += f" --jobs {self.setup.jobs}" if self.setup.jobs > 1 else ""
         words = ["pmt", "train", str(self.out / "config.toml"), "--out", str(self.out), "--resume"]
         return shlex.join(words) + split

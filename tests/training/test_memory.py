@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pmt_jax.training import compile, memory
+from pmt_jax.training import compile
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ from pmt_jax.training import compile, memory
     ],
 )
 def test_what_cannot_fit_is_refused(flags, says, cli, monkeypatch, tmp_path: pathlib.Path):
-    monkeypatch.setattr(memory, "_device_memory", lambda: 10e6)
+    monkeypatch.setattr(compile, "_device_memory", lambda: 10e6)
     code, _, err = cli("train", "lane", "--steps", "1e6", *flags, "--out", tmp_path / "x")
     assert code == 2 and says in err and err.count("\n") == 1
     assert not (tmp_path / "x").exists()
