@@ -71,13 +71,14 @@ def start(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
 
     Raises:
       Lost: a worker ended meanwhile; their programs raise it too.
+      UsageError: what `compile_run` raises.
     """
     config = setup.config
     say(f"compiling {config.log_interval} update(s) of {config.method} on {setup.vector.spec.name} in every worker ...")
     workers = Workers(setup)
     try:
         states, measures, said = zip(*map(workers.receive, range(setup.jobs)), strict=True)
-    except Lost:
+    except UsageError:
         workers.close()
         raise
     say(said[0])
@@ -131,9 +132,12 @@ class Workers:
     def receive(self, rank: int) -> Any:
         """What a worker sends next."""
         try:
-            return self._pipes[rank].recv()
+            received = self._pipes[rank].recv()
         except (EOFError, OSError):
             raise self._lost(rank) from None
+        if isinstance(received, UsageError):
+            raise received
+        return received
 
     def _send(self, rank: int, what: Any) -> None:
         try:
@@ -175,7 +179,11 @@ def serve() -> None:
     for name, value in settings.items():
         jax.config.update(name, value)
     said: list[str] = []
-    state, programs = compile_run(make_setup(config), said.append)
+    try:
+        state, programs = compile_run(make_setup(config), said.append)
+    except UsageError as error:
+        pipe.send(error)
+        return
     pipe.send((pack(state), programs.measures, said[-1]))
     with contextlib.suppress(EOFError):
         while True:

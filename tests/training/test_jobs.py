@@ -7,10 +7,11 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import psutil
 import pytest
 
-from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
+from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, saved
 
 JOBS = ("train", *ARGUMENTS, "--jobs", 2)
 
@@ -25,43 +26,35 @@ def begun(out: pathlib.Path, *more: object) -> subprocess.Popen[str]:
 
 
 @pytest.mark.full
-def test_workers_train_what_one_process_trains(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
-    """Also where the run goes on with other numbers of workers."""
-    out = tmp_path / "run"
-    code, text, err = cli(*JOBS, "--steps", STEPS, "--out", out)
+def test_a_workers_seeds_equal_the_run_of_these_seeds_alone(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    """Three seeds in two workers: 0 and 1, and 2."""
+    out, alone = tmp_path / "run", tmp_path / "alone"
+    code, text, err = cli("train", *ARGUMENTS, "--seeds", 3, "--jobs", 2, "--steps", STEPS, "--out", out)
     assert (code, err) == (0, "") and "2 worker processes share the seeds and the CPUs" in text
-    assert_same_run(out, whole)
-
-    out, half = tmp_path / "other", STEPS // 2
-    assert cli("train", *ARGUMENTS, "--steps", half, "--out", out)[0] == 0
-    code, text, _ = cli(*JOBS, "--steps", STEPS, "--out", out, "--resume")
-    assert code == 0 and "changed since the run began: jobs 1 -> 2; the run may not continue bit for bit" in text
-    assert_same_run(out, whole)
-
-
-@pytest.mark.full
-def test_seeds_that_cannot_be_shared_evenly_equal_the_runs_of_their_parts(tmp_path: pathlib.Path, cli):
-    together = (*ARGUMENTS, "--steps", STEPS // 2)
-    assert cli("train", *together, "--seeds", 3, "--jobs", 2, "--out", tmp_path / "run")[0] == 0
-    parts = []
-    for seed, seeds in ((0, 2), (2, 1)):
-        out = tmp_path / f"part-{seed}"
-        assert cli("train", *together, "--seed", seed, "--seeds", seeds, "--out", out)[0] == 0
-        parts += rows(out)
-    ours = [row | {"seconds": 0} for row in rows(tmp_path / "run")]
-    theirs = sorted((row | {"seconds": 0} for row in parts), key=lambda row: (row["step"], row["seed"]))
-    assert ours == theirs
+    assert cli("train", *ARGUMENTS, "--seed", 2, "--seeds", 1, "--steps", STEPS, "--out", alone)[0] == 0
+    ours = [row | {"seconds": 0} for row in rows(out)]
+    theirs = [row | {"seconds": 0} for row in (*rows(whole), *rows(alone))]
+    assert ours == sorted(theirs, key=lambda row: (row["step"], row["seed"]))
+    first, second = saved(whole), saved(alone)
+    for path, x in saved(out).items():
+        assert np.array_equal(x, np.concatenate([first[path], second[path]])), path
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_all_seeds_and_the_run_goes_on(number: int, tmp_path: pathlib.Path, cli):
+def test_a_run_goes_on_in_workers(copy: pathlib.Path, cli):
+    code, text, err = cli(*JOBS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    assert (code, err) == (0, "") and rows(copy)[-1]["step"] == STEPS + 200
+    assert "changed since the run began: jobs 1 -> 2; the run may not continue bit for bit" in text
+
+
+@pytest.mark.full
+def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cli):
     """The signal reaches the workers too, as SLURM's do."""
     process = begun(tmp_path / "run")
     for each in (process, *psutil.Process(process.pid).children()):
-        each.send_signal(number)
+        each.send_signal(signal.SIGTERM)
     text, err = process.communicate(timeout=120)
-    assert process.returncode == 128 + number and not err
+    assert process.returncode == 128 + signal.SIGTERM and not err
     assert f"--out {tmp_path / 'run'} --resume --jobs 2" in text.splitlines()[-1]
     goal = rows(tmp_path / "run")[-1]["step"] + STEPS // 4
     assert cli(*JOBS, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
