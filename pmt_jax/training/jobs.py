@@ -1,8 +1,8 @@
 """Worker processes that share the seeds of a run and the CPUs of a host.
 
-One program keeps few cores busy with its learner; several keep one each. A worker keeps no state: it receives its
-seeds' states with every call and returns new ones. Files, signals and seeds that break therefore stay where they are
-in a run of one process, and what a lost worker had not returned is all that is lost.
+One program keeps few cores busy with its learner; several keep one each. Workers are functions: every call returns the
+new states of their seeds to the run's process. Files, signals and seeds that break therefore stay where they are in a
+run of one process, and what a lost worker had not returned is all that is lost.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Workers:
 
     def call(self, program: str, state: LearnerState) -> Any:
         """What every worker's `program` returns for its seeds of `state`, put together along the seeds."""
-        packed = pack(state)
+        packed = {} if state is self._newest else pack(state)  # the workers have what they returned last
         for rank, (begin, end) in enumerate(self._bounds):
             self._send(rank, (program, {path: x[begin:end] for path, x in packed.items()}))
         results = [self.receive(rank) for rank in range(len(self._bounds))]
@@ -126,8 +126,9 @@ class Workers:
         return self.together(states), _joined(metrics)
 
     def together(self, states: Sequence[dict[str, np.ndarray]]) -> LearnerState:
-        """The state of all seeds from the workers' packed ones."""
-        return unpack(_joined(states), self._like)
+        """The state of all seeds from the packed ones that the workers have just returned."""
+        self._newest = unpack(_joined(states), self._like)
+        return self._newest
 
     def receive(self, rank: int) -> Any:
         """What a worker sends next."""
@@ -188,7 +189,7 @@ def serve() -> None:
     with contextlib.suppress(EOFError):
         while True:
             program, packed = pipe.recv()
-            given = unpack(packed, state)
+            given = unpack(packed, state) if packed else state
             if program == "evaluate":
                 assert programs.evaluate
                 pipe.send(jax.device_get(programs.evaluate(given)))
