@@ -27,7 +27,7 @@ class Case:
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
-      jobs: worker processes that share the seeds of a training and the CPUs; cases with more jobs than CPUs are left out.
+      jobs: worker processes that share the seeds of a training and the CPUs; cases with more jobs than CPUs do not run.
       settings: other settings of the training; alone, other options of the environment.
     """
 
