@@ -34,11 +34,11 @@ from .study import (
 from .tables import markdown
 
 MEASURES = ("end", "training", "reward")
-AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001, "emotion_lr_start": 0.0}
+AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001, "fear_lr_start": 0.0}
 A, C, D = (
     {"emotion_lr": 0.003},
     {"emotion_lr": 0.01},
-    {"emotion_lr_start": 0.01},
+    {"fear_lr_start": 0.01},
 )  # question b, all with `fear_start` nan
 
 
@@ -124,6 +124,16 @@ def as_fourth(file: pathlib.Path) -> str:
     return beside([_first(same, method="mappo_l") for same in cells])
 
 
+def as_fifth(file: pathlib.Path) -> str:
+    """Question b in the fifth round: criterion 1 on the grid, over the seeds of the fourth round and of this one."""
+    rounds = [runs.load(file.with_name("study_fourth_h200.json")), runs.load(file)]
+    pooled = []
+    for cell in ({"method": "f4sg", **D}, {"method": "mappo_l"}):
+        scores = [_read([_cell(found, "voltage_33", 1.0, **cell)])[0] for found in rounds]
+        pooled.append({name: np.concatenate([x[name] for x in scores]) for name in MEASURES})
+    return _as_criteria([_lag("voltage_33", *pooled)], "candidate D, 80 seeds")
+
+
 def as_power(file: pathlib.Path) -> str:
     """Question f: F4SG beside MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
     return beside([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
@@ -141,11 +151,14 @@ def _while_training(
     for task in tasks:
         cells = [_cell(found, task, 1.0, method="f4sg", **candidate, **more)]
         cells.append(_cell(found, task, 1.0, method="mappo_l", **more))
-        own, base = _read(cells, [run for run in among if run["task"] == task])
-        middle, half = welch(own["training"], base["training"])
-        what = f"true cost while training, less MAPPO-L's, `{task}`, p = 1"
-        body.append(["1", what, difference(own, base), middle < 1 and middle + half < 5])
+        body.append(_lag(task, *_read(cells, [run for run in among if run["task"] == task])))
     return body
+
+
+def _lag(task: str, own: dict[str, Scores], base: dict[str, Scores]) -> list:
+    middle, half = welch(own["training"], base["training"])
+    what = f"true cost while training, less MAPPO-L's, `{task}`, p = 1"
+    return ["1", what, difference(own, base), middle < 1 and middle + half < 5]
 
 
 def _at_the_end(
@@ -243,8 +256,8 @@ def as_prior_in_time(file: pathlib.Path) -> str:
     return markdown(["method", "mean", *(f"to {x / 1e6:.1f} M" for x in run["steps"])], body)
 
 
-def as_action(file: pathlib.Path) -> str:
-    """Question c, the last response: R4SG by the letter and with regret about the action not taken, beside MAPPO-L."""
+def as_beside_mappo_l(file: pathlib.Path) -> str:
+    """All cells of a file beside MAPPO-L, at the last update that all of them reached."""
     return beside([_first(runs.load(file), method="mappo_l")])
 
 
@@ -313,8 +326,9 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "responses": as_responses,
     "candidate_d": as_candidate_d,
     "fourth": as_fourth,
+    "fifth": as_fifth,
     "power": as_power,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
-    "action": as_action,
+    "beside_mappo_l": as_beside_mappo_l,
 }

@@ -26,9 +26,10 @@ Scores = NDArray[np.float64]  # [seeds]
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 SHOWN = {"lambda_init": "lambda from {}", "emotion_lr": "`emotion_lr` {}", "fear_start": "`fear_start` {}"}
 SHOWN |= {"regret_response": "`{}`", "lambda_kp": "`lambda_kp` {}", "lr_half_life": "`lr_half_life` {}"}
-SHOWN |= {name: f"`{name}` {{}}" for name in ("emotion_lr_start", "kappa", "surrogate_weight", "regret_max")}
+SHOWN |= {name: f"`{name}` {{}}" for name in ("fear_lr_start", "kappa", "surrogate_weight", "regret_max")}
 SHOWN |= {name: f"`{name}` {{}}" for name in ("num_envs", "init_fear")}
 SHOWN |= {"sway": "the corridor moves, {}"}
+OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 LAST = 0.1  # share of the steps that count as the end
 
 
@@ -70,9 +71,9 @@ def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
 
 
 def settings(run: runs.Run) -> dict[str, Any]:
-    """The run's settings; those that are newer than it have their defaults."""
+    """The run's settings; those that are newer than it have what was done before."""
     stored = _config(run["config"])
-    return {key: getattr(Config, key, "none") for key in SHOWN} | stored | (stored.get("env") or {})
+    return {key: getattr(Config, key, "none") for key in SHOWN} | OLD | stored | (stored.get("env") or {})
 
 
 @functools.cache  # a table asks for the settings of a run many times

@@ -205,6 +205,7 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "memory, GB": _shown("{:.1f}", "memory_gb"),
     "GPU busy": _shown("{:.0%}", "gpu_busy"),
     "compile cache": _shown("{}", "cache"),
+    "kernels, s": _shown("{:.1f}", "kernel_seconds"),
     "first update, s": _shown("{:.1f}", "first_update_seconds"),
     "ours f32 is faster by (lowest)": _ours_cell,
     "CR": _shown("{:.3f}", "info/totally_controllable_ratio"),
@@ -336,6 +337,9 @@ SIZES = "seeds x environments x steps"
 TABLES: dict[str, Callable[[Reports], str]] = {
     "ant": Table("ant", EVERY, SPEED),
     "starts": Table("ant", ("start",), ("what", "compile cache", "compile, s", "first update, s", "memory, GB")),
+    "gpu_starts": Table(
+        "start", ("start",), ("what", "compile cache", "kernels, s", "compile, s", "first update, s", "memory, GB")
+    ),
     "walls": Table(
         "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
     ),

@@ -122,16 +122,16 @@ class Hyper:
         0.05, "cost advantages are divided by their standard deviation, but never by less than this", NOT_NEGATIVE
     )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
-    emotion_lr_start: float = emotion(
-        0.0,
-        "learning rate of the fear and regret networks in the first update, if above emotion_lr; in update t it is "
-        "this over t, until it reaches emotion_lr",
+    fear_lr_start: float = emotion(
+        1e-2,
+        "learning rate of the fear network in the first update, if above emotion_lr; in update t it is this over t, "
+        "until it reaches emotion_lr",
         NOT_NEGATIVE,
     )
     fear_start: float = emotion(
-        -4.0,
+        math.nan,
         "fear before any experience, as a logit: -4 is a probability of 0.018; nan takes the cost rate of the first "
-        "batch, for tasks whose danger is dense from the first step",
+        "batch",
         Bound("be a logit between -20 and 20, or nan", lambda x: math.isnan(x) or -20 <= x <= 20),
     )
     fear_l2: float = emotion(
@@ -264,6 +264,8 @@ class Config(Hyper):
     def __post_init__(self) -> None:
         if math.isnan(self.surrogate_weight):
             object.__setattr__(self, "surrogate_weight", float(self.rollout_length))
+        if math.isnan(self.fear_start):  # always the same nan, so that equal settings compare equal
+            object.__setattr__(self, "fear_start", math.nan)
         if self.trust_steps == 0:
             object.__setattr__(self, "trust_steps", self.minibatches)
         _validate(self)

@@ -174,6 +174,8 @@ def appraise_fear(
         distance = divergence(logits, cost, setup.config.fear_loss, noise, hyper.temperature)
         return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
 
+    # A network that knows nothing yet learns faster, so that fear does not lag where danger is dense from the start.
+    hyper = dataclasses.replace(hyper, emotion_lr=jnp.maximum(hyper.emotion_lr, hyper.fear_lr_start))
     net, metrics = fit(net, loss, (*rows, noise), key, **_fit_options(setup, hyper))
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     return net, fear, {**metrics, **calibration(remembered, batch.cost)}

@@ -155,8 +155,8 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     """`hyper` with the learning rates after so many updates."""
     # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
     left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
-    emotion_lr = jnp.maximum(hyper.emotion_lr, hyper.emotion_lr_start / (update + 1))
-    rates = {"actor_lr": hyper.actor_lr, "critic_lr": hyper.critic_lr, "emotion_lr": emotion_lr}
+    rates = {name: getattr(hyper, name) for name in ("actor_lr", "critic_lr", "emotion_lr")}
+    rates["fear_lr_start"] = hyper.fear_lr_start / (update + 1)
     return dataclasses.replace(hyper, **{name: rate * left for name, rate in rates.items()})
 
 

@@ -40,11 +40,11 @@ def test_an_update_from_nan_is_finite_everywhere():
     assert jnp.isfinite(metrics["fear/loss"])
 
 
-def test_fear_is_calibrated_after_thirty_updates():
-    """Of 12 seeds the expected calibration error is 0.39 +- 0.05 in the first update and 0.055 +- 0.023 in the last."""
+def test_fear_tells_danger_from_safety_after_sixty_updates():
+    """Of 12 seeds the mean squared error is 0.240 +- 0.007 in the first update and 0.037 +- 0.009 in the last."""
     hyper = PROGRAM.hyper(actor_lr=0.0)
     state, errors = PROGRAM.init(hyper, jax.random.key(0)), []
-    for _ in range(30):
+    for _ in range(60):
         state, metrics = PROGRAM.step(hyper, state)
-        errors.append(float(metrics["fear/ece"]))
-    assert errors[0] > 0.2 and errors[-1] < 0.15
+        errors.append(float(metrics["fear/brier"]))
+    assert errors[0] > 0.2 and errors[-1] < 0.1

@@ -114,13 +114,20 @@ def test_learning_rates_decay_beyond_two_to_the_31_steps():
     np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
 
 
-def test_the_learning_rate_of_emotions_falls_to_its_final_value():
-    setup = make_setup(load_config("lane", emotion_lr=1e-3, emotion_lr_start=1e-2))
-    updates = jnp.asarray([0, 1, 3, 9, 10, 2**31 - 1], jnp.int32)
-    rates = jax.vmap(lambda update: learner._annealed(setup, setup.hyper, update).emotion_lr)(updates)
-    np.testing.assert_allclose(rates, [1e-2, 5e-3, 2.5e-3, 1e-3, 1e-3, 1e-3], rtol=1e-6)
-    usual = dataclasses.replace(setup.hyper, emotion_lr_start=jnp.float32(0))
-    assert learner._annealed(setup, usual, updates[0]).emotion_lr == setup.hyper.emotion_lr
+def test_fear_learns_faster_in_its_first_updates():
+    made = program("mixed")
+    setup, plain = made.setup, made.hyper(fear_lr_start=0.0)
+    updates = jnp.asarray([0, 1, 3], jnp.int32)
+    rates = jax.vmap(lambda update: learner._annealed(setup, made.hyper(fear_lr_start=1e-2), update).fear_lr_start)
+    np.testing.assert_allclose(rates(updates), [1e-2, 5e-3, 2.5e-3], rtol=1e-6)
+    begin = made.init(plain, jax.random.key(0))
+    quick, rate = made.step(made.hyper(fear_lr_start=1e-2), begin)[0], setup.config.emotion_lr
+    slow, also_slow = (made.step(made.hyper(fear_lr_start=x), begin)[0] for x in (0.0, rate))
+    chex.assert_trees_all_equal(slow, also_slow)
+    chex.assert_trees_all_equal(quick.regret, slow.regret)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(quick.fear, slow.fear)
+    chex.assert_trees_all_equal(quick.fear, made.step(made.hyper(fear_lr_start=0.0, emotion_lr=1e-2), begin)[0].fear)
 
 
 @pytest.mark.full

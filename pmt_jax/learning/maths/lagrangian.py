@@ -65,8 +65,8 @@ def lowered_limit(
 
     A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. If
     the step already does nothing but lower the cost, the limit is not lowered further: it would have to rise again.
-    Nor is it lowered by more than the cost itself: what adds up while a policy is far beyond the limit would keep it in
-    recovery for good.
+    It is not lowered by more than the cost itself: what adds up while a policy is far beyond the limit would keep the
+    policy in recovery for good.
 
     Args:
       lowered: [...] so far, cost_excess: S [...], and held: [...], the limit d, all in cost per step;
