@@ -93,7 +93,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
 
 
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
-    """One update: act, appraise, estimate advantages, fit the critics, cope."""
+    """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
     hyper = _annealed(setup, hyper, state.update)

@@ -1,10 +1,11 @@
 """How a run is split over devices: one mesh with the axes seed and env, and what the learner calls to use it.
 
 Seeds exchange only metrics, so as many devices as possible share the seeds; the rest share each seed's environments.
-Environments step where they are (`apart`): physics engines are opaque to XLA's partitioner, which would hand every
-device all of them. The learner's rows are gathered once for each network's epochs (`shared`), every minibatch is cut
-into equal parts (`split`), and the partitioner sums the gradients. Random numbers do not depend on the split. Without a
-mesh these functions return what they are given, so that one device runs the program it would run without them.
+Environments step on their own device (`per_device`): XLA's partitioner cannot look into physics engines and would give
+all of them to every device. The learner's rows are gathered once for each network's epochs (`replicate`), every
+minibatch is cut into equal parts (`shard`), and the partitioner sums the gradients. Random numbers do not depend on the
+number of devices. Without a mesh these functions return their argument, so one device runs the same program as without
+them.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def make_mesh(config: Config, count: int | None) -> Mesh | None:
         return None
     seeds = math.gcd(config.seeds, count)
     _check_even(config, count, seeds)
-    # As inputs of what each device runs apart (`apart`), constants without entries, of which MJX-Warp has many, bring
-    # XLA's partitioner down (jaxlib 0.11.2); so constants stay where they are used.
+    # MJX-Warp has many constants without entries. As inputs of a `per_device` function they crash XLA's partitioner
+    # (jaxlib 0.11.2); so constants stay where they are used.
     jax.config.update("jax_use_simplified_jaxpr_constants", True)
     axes = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((seeds, count // seeds), (SEED, ENV), axes, devices=present[:count])

@@ -115,7 +115,7 @@ def test_models_compile_to_the_recorded_arrays(robot):
     assert seen > 30
 
 
-def test_the_table_of_robots_is_the_specifications():
+def test_robots_have_the_masses_and_integrators_of_the_original():
     substeps = {"half_cheetah": (5, 0.01, "EULER"), "ant": (5, 0.01, "RK4"), "hopper": (4, 0.002, "RK4")}
     substeps |= {"walker2d": (4, 0.002, "RK4"), "swimmer": (4, 0.01, "RK4"), "humanoid": (5, 0.003, "RK4")}
     masses = {"ant": 0.91088008, "half_cheetah": 14.0, "hopper": 15.8200134, "walker2d": 23.6771366}
