@@ -234,11 +234,10 @@ class Config(Hyper):
     regret_target: Literal["mode", "tail"] = emotion(
         "mode", "how deliberate an action was: density relative to the mode, or tail probability"
     )
-    regret_response: Literal["letter", "one_sided", "advantage", "counterfactual"] = emotion(
+    regret_response: Literal["letter", "one_sided", "advantage"] = emotion(
         "letter",
         "letter: the change of regret weights the ratio, as in the paper; one_sided: regret itself weakens updates "
-        "that repeat the action and strengthens those that avoid it; advantage: regret weights the cost advantage; "
-        "counterfactual: the learned danger of the action less that of alternatives takes the cost advantage's place",
+        "that repeat the action and strengthens those that avoid it; advantage: regret weights the cost advantage",
     )
     init_fear: str = emotion(
         "", "run folder whose fear network is the start, as a prior; agents of another team start with its mean"

@@ -9,15 +9,13 @@ import jax
 import jax.numpy as jnp
 
 from ..config.settings import Hyper
-from .optimise import Loss, fit
+from .optimise import fit
 from .rollout import flatten_steps
 from .setup import Setup
 from .types import Batch, Metrics, Params, TrainState
 
 SMOOTHING = 0.01
 BINS = 10
-ALTERNATIVES = 8  # actions not taken that one is regretted against
-CALM = -4.0  # logit of an action's danger before any experience, as fear's
 
 FearLoss = Literal["ce", "gumbel_fwd", "gumbel_rev"]
 
@@ -190,8 +188,8 @@ def appraise_regret(
       the networks of all agents, log w [T, B, N] (0 without regret), and metrics: mean regret per action entry on
       costly steps, what it would be on safe ones were they costly, and the weight w over all rows.
     """
-    if net is None or setup.config.regret_response == "counterfactual":
-        return net, jnp.zeros_like(batch.log_prob), {}
+    if net is None:
+        return None, jnp.zeros_like(batch.log_prob), {}
     mask = jnp.asarray(setup.vector.spec.action_mask)
     state = jnp.broadcast_to(batch.state[:, :, None], (*batch.log_prob.shape, batch.state.shape[-1]))
     logits = jax.vmap(setup.nets.regret, (0, 2, 2), 2)
@@ -208,7 +206,10 @@ def appraise_regret(
         distance = divergence(logits, target, "ce", jnp.zeros_like(logits), 1.0)
         return appraisal_loss(distance, logits, old, weight, hyper.regret_l2), {}
 
-    learned, metrics = _fit_agents(setup, hyper, net, loss, rows, key)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
+    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, each[1], each[2], **_fit_options(setup, hyper)))(
+        net, rows, keys
+    )
     # Adam's momentum would move a network that had nothing to learn from.
     learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
     after = logits(learned.params, state, batch.action)
@@ -234,69 +235,7 @@ def appraise_regret(
         "weight_mean": weight.mean(),
         "weight_std": weight.std(),
     }
-    return learned, log_weight, {**metrics, **diagnostics}
-
-
-def appraise_actions(
-    setup: Setup, hyper: Hyper, net: TrainState, batch: Batch, cost_returns: jax.Array, key: jax.Array
-) -> tuple[TrainState, jax.Array, Metrics]:
-    """Learns how dangerous a joint action is, then regrets each agent's part of it against parts not taken.
-
-    Regret is g(s, a) - mean_j g(s, a with the agent's part drawn anew from its policy): above 0 where the action is to
-    be regretted, below 0 where it was the safer choice, 0 where all are alike. The danger g is (1 - gamma) times the
-    discounted cost that follows, in [0, 1] as costs are. Its networks remember earlier batches, so where harm is
-    seldom felt regret has less noise than the cost advantage whose place it takes.
-
-    Args:
-      cost_returns: [T, B, N, K], what the cost critic learns.
-
-    Returns:
-      the networks of all agents, regret [T, B, N, K] in the unit of a cost advantage, and metrics: its mean, as a
-      difference of g, where the step was felt as costly and where it was not.
-    """
-    state = jnp.broadcast_to(batch.state[:, :, None], (*batch.log_prob.shape, batch.state.shape[-1]))
-    own = jnp.eye(setup.nets.num_agents, dtype=bool)[..., None]
-
-    def danger(params: Params, state: jax.Array, joint: jax.Array) -> jax.Array:
-        return setup.nets.regret(params, state, joint) + CALM
-
-    def with_own(part: jax.Array) -> jax.Array:
-        """The joint action with one agent's part replaced, for each: [T, B, N, A] -> [T, B, N, N A]."""
-        joint = jnp.where(own, part[:, :, None], batch.action[:, :, None])
-        return joint.reshape(*joint.shape[:3], -1)
-
-    def appraise(net: TrainState, part: jax.Array) -> jax.Array:
-        return jax.nn.sigmoid(jax.vmap(danger, (0, 2, 2), 2)(net.params, state, with_own(part)))
-
-    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
-        state, joint, target, old = rows
-        logits = danger(params, state, joint)
-        distance = divergence(logits, target, "ce", jnp.zeros_like(logits), 1.0)
-        return appraisal_loss(distance, logits, old, jnp.ones_like(target), hyper.regret_l2), {}
-
-    target = jnp.clip((1 - hyper.gamma) * cost_returns, 0.0, 1.0)
-    rows = (state, with_own(batch.action), target, appraise(net, batch.action))
-    rows = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), rows)
-    net, metrics = _fit_agents(setup, hyper, net, loss, rows, key)
-    noise = jax.random.normal(jax.random.fold_in(key, setup.nets.num_agents), (ALTERNATIVES, *batch.action.shape))
-    alternatives = jax.lax.map(lambda z: appraise(net, batch.mean + batch.std * z), noise)
-    felt = appraise(net, batch.action) - alternatives.mean(0)
-    costly = batch.cost > 0
-    diagnostics = {
-        "on_costly": (felt * costly).sum() / costly.sum(),
-        "on_safe": (felt * ~costly).sum() / (~costly).sum(),
-    }
-    return net, felt / (1 - hyper.gamma), {**metrics, **diagnostics}
-
-
-def _fit_agents(
-    setup: Setup, hyper: Hyper, net: TrainState, loss: Loss, rows: tuple[jax.Array, ...], key: jax.Array
-) -> tuple[TrainState, Metrics]:
-    """Fits each agent's network to its rows [N, R, ...]; metrics are means over agents."""
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
-    one = jax.vmap(lambda *each: fit(each[0], loss, each[1], each[2], **_fit_options(setup, hyper)))
-    net, metrics = one(net, rows, keys)
-    return net, {k: x.mean(0) for k, x in metrics.items()}
+    return learned, log_weight, {**{k: x.mean(0) for k, x in metrics.items()}, **diagnostics}
 
 
 def _fit_options(setup: Setup, hyper: Hyper) -> dict[str, Any]:

@@ -111,10 +111,6 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
     advantage, returns = gae(batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
-    danger = None
-    if regret is not None and setup.config.regret_response == "counterfactual":
-        appraised = emotions.appraise_actions(setup, hyper, regret, batch, cost_returns, tagged[Tag.REGRET])
-        regret, danger, regret_metrics = appraised
 
     # 4 Critics.
     rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
@@ -128,7 +124,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
     cost_excess = _cost_excess(setup, hyper, episode_cost)
     weigh = functools.partial(_weight_of_cost, setup, hyper, state, cost_excess)
-    rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight, danger)
+    rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
 
     computed = {"batch": batch, "fear": fear, "cost_signal": cost_signal, "regret": regret, "log_weight": log_weight}

@@ -76,7 +76,6 @@ class Networks:
     Attributes:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
-      regret_inputs: entries that an agent's regret network sees.
     """
 
     num_actors: int
@@ -89,7 +88,6 @@ class Networks:
     cost_critic: MLP
     fear_net: MLP
     regret_net: MLP
-    regret_inputs: int
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -131,7 +129,8 @@ class Networks:
     def init_regret(self, key: jax.Array) -> Params:
         """Weights with a leading [num_agents]."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_agents))
-        return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.regret_inputs)))(keys)
+        action_dim = self.actor.trunk.outputs
+        return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.state_dim + action_dim)))(keys)
 
     def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
@@ -175,10 +174,7 @@ class Networks:
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
     def regret(self, params: Params, state: jax.Array, action: jax.Array) -> jax.Array:
-        """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A].
-
-        With the response `counterfactual`, those of danger: state [..., S], joint action [..., N A] -> [..., K].
-        """
+        """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
         return _apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
 
@@ -194,7 +190,6 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         input_norm = config.obs_norm == "layernorm"
         return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
 
-    counterfactual = config.regret_response == "counterfactual"
     return Networks(
         num_actors=1 if share_actor else spec.num_agents,
         num_agents=spec.num_agents,
@@ -205,6 +200,5 @@ def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
         fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
-        regret_net=mlp(spec.num_costs if counterfactual else spec.action_dim, 0.01),
-        regret_inputs=spec.state_dim + spec.action_dim * (spec.num_agents if counterfactual else 1),
+        regret_net=mlp(spec.action_dim, 0.01),
     )

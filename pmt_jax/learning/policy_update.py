@@ -48,21 +48,15 @@ def policy_rows(
     advantage: jax.Array,
     cost_advantage: jax.Array,
     log_weight: jax.Array,
-    danger: jax.Array | None = None,
 ) -> PolicyRows:
     """The batch as every agent's policy sees it, leaves [N, R, ...].
 
     Args:
       multiplier: [N, K]; advantage: [T, B]; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
-      danger: [T, B, N, K] what the policies' loss takes for the cost advantage, in its unit; the multiplier's step
-        keeps to the cost advantage.
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
     scaled_cost = scaled if setup.config.cost_advantage == "std" else centred
-    if danger is not None:
-        unit = jnp.maximum(cost_advantage.std((0, 1)) + 1e-5, hyper.cost_std_floor)
-        scaled_cost = standardise(danger)[0] / (unit if setup.config.cost_advantage == "std" else 1.0)
     if setup.config.regret_response == "advantage":
         scaled_cost, log_weight = scaled_cost * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
     price = multiplier * (setup.method.constraint == "lagrangian")

@@ -154,8 +154,8 @@ class LearnerState(ActingState):
     Attributes:
       actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
-      fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N] (with the
-        response `counterfactual` g(s, a) -> logits [K]); None in methods without them.
+      fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
+        without them.
       multiplier: [N, K], lambda; with `lambda_rule = pid` its integral; of MACPO what its limit is lowered by,
         in cost per step.
       episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier is updated with.

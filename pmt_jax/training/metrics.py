@@ -79,8 +79,8 @@ METRICS: dict[str, Metric] = {
     "fear/on_safe": Metric("", "mean fear where no cost followed"),
     "regret/loss": Metric("", "loss of the regret networks, in an update's last epoch"),
     "regret/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
-    "regret/on_costly": Metric("", "mean regret of an action entry (counterfactual: of an action) on costly steps"),
-    "regret/on_safe": Metric("", "mean regret on steps without cost, were they costly (counterfactual: as they are)"),
+    "regret/on_costly": Metric("", "mean regret of an action entry on costly steps"),
+    "regret/on_safe": Metric("", "mean probability of regret of an action entry on steps without cost"),
     "regret/weight_mean": Metric("", "mean of the weight that regret puts on the probability ratio"),
     "regret/weight_std": Metric("", "standard deviation of that weight"),
 }

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
-import functools
 import pathlib
 import re
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +13,8 @@ import optax
 import pytest
 
 import pmt_jax
-from pmt_jax import load_config, make_setup
 from pmt_jax.learning import emotions
 from pmt_jax.learning.emotions import regret_weight
-from pmt_jax.learning.optimise import init_train_state
-from pmt_jax.learning.types import Batch, TrainState
-from small import SMALL
 
 TOP = {"choose": "top", "regret_max": 0.9}
 
@@ -195,43 +188,3 @@ def test_every_equation_is_one_function(number: int):
                     if str(number) in numbers.split(", "):
                         named.append(f"{path.name}:{node.name}")
     assert len(named) == 1, named
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Regret about the action not taken
-
-
-@functools.cache
-def regretted() -> tuple[np.ndarray, Callable[[jax.Array], jax.Array]]:
-    """Where agent 0's action was above 0 [T, B], and costs [T, B, 2, 1] -> learned regret of both agents [T, B, 2]."""
-    setup = make_setup(load_config("switch", method="r4sg", regret_response="counterfactual", **SMALL))
-    hyper = dataclasses.replace(setup.hyper, gamma=jnp.float32(0), emotion_lr=jnp.float32(1e-2))
-    key, shape = jax.random.key(0), (40, 16, 2)
-    action = jax.random.normal(key, (*shape, 2))
-    known = {"state": jnp.zeros((*shape[:2], setup.vector.spec.state_dim)), "action": action}
-    known |= {"mean": jnp.zeros_like(action), "std": jnp.ones_like(action), "log_prob": jnp.zeros(shape)}
-    empty = dict.fromkeys((field.name for field in dataclasses.fields(Batch)), jnp.zeros(()))
-
-    def regret(cost: jax.Array) -> jax.Array:
-        def appraise(net: TrainState, _: object) -> tuple[TrainState, jax.Array]:
-            batch = Batch(**empty | known | {"cost": cost})
-            net, regret, _ = emotions.appraise_actions(setup, hyper, net, batch, cost, key)
-            return net, regret[..., 0]
-
-        start = jax.vmap(init_train_state)(setup.nets.init_regret(key))
-        return jax.lax.scan(appraise, start, length=60)[1][-1]
-
-    return np.asarray(action[..., 0, 0] > 0), jax.jit(regret)
-
-
-def test_an_action_is_regretted_where_the_alternative_was_safe():
-    above, regret = regretted()
-    cost = jnp.broadcast_to(jnp.where(above, 0.8, 0.0)[..., None, None], (*above.shape, 2, 1))
-    mine, others = np.moveaxis(np.asarray(regret(cost)), -1, 0)
-    np.testing.assert_allclose([mine[~above].mean(), mine[above].mean()], [-0.4, 0.4], atol=0.06)  # half of all cost
-    np.testing.assert_allclose([others[~above].mean(), others[above].mean()], 0, atol=0.06)  # it is agent 0's danger
-
-
-def test_nothing_is_regretted_where_all_actions_are_alike():
-    above, regret = regretted()
-    np.testing.assert_allclose(regret(jnp.full((*above.shape, 2, 1), 0.4)), 0, atol=0.02)

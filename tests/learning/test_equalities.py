@@ -125,17 +125,6 @@ def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
         chex.assert_trees_all_close(weights(trained("r4sg", regret_response=response)[0]), plain, rtol=1e-4)
 
 
-@pytest.mark.full
-def test_regret_about_the_action_not_taken_acts_by_the_price_of_cost():
-    response = {"regret_response": "counterfactual"}
-    free = [
-        trained(name, **more, lambda_init=0.0, lambda_lr=0.0)[0] for name, more in (("r4sg", response), ("happo", {}))
-    ]
-    chex.assert_trees_all_equal(*map(weights, free))
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_close(weights(trained("r4sg", **response)[0]), weights(trained("mappo_l")[0]), rtol=1e-4)
-
-
 def test_regret_stands_still_where_nothing_ever_costs():
     setup, state, batch = acted()
     harmless = dataclasses.replace(batch, cost=jnp.zeros_like(batch.cost))
