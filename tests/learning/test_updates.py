@@ -133,7 +133,7 @@ def test_fear_learns_faster_in_its_first_updates():
 def test_learning_rates_of_all_networks_halve_in_their_half_life():
     made = program("mixed")
     plain = made.setup.hyper
-    halved = {name: getattr(plain, name) / 2 for name in ("actor_lr", "critic_lr", "emotion_lr")}
+    halved = {name: getattr(plain, name) / 2 for name in ("actor_lr", "critic_lr", "emotion_lr", "fear_lr_start")}
     falling = made.hyper(lr_half_life=made.setup.config.batch_size)
     first, _ = made.step(falling, made.init(plain, jax.random.key(0)))
     chex.assert_trees_all_equal(first, made.step(plain, made.init(plain, jax.random.key(0)))[0])
