@@ -56,6 +56,7 @@ def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
     assert shown["cost_excess"] == others["cost_excess"] and shown["cost_beyond"] < others["cost_beyond"]
 
 
+@pytest.mark.full
 def test_macpo_keeps_to_the_limit_that_it_lowered():
     made = program("macpo")
     horizon, start = made.setup.vector.horizon, made.init(made.setup.hyper, jax.random.key(0))

@@ -113,20 +113,31 @@ def test_learning_rates_decay_beyond_two_to_the_31_steps():
     np.testing.assert_allclose(rates, expected, rtol=1e-5, atol=1e-30)
 
 
-def test_fear_learns_faster_in_its_first_updates():
+def test_fears_first_learning_rate_falls_with_the_updates():
+    setup = make_setup(load_config("lane", method="mixed", num_envs=128, rollout_length=64))
+    hyper = dataclasses.replace(setup.hyper, fear_lr_start=jnp.float32(1e-2))
+    rates = jax.vmap(lambda update: learner._annealed(setup, hyper, update).fear_lr_start)
+    np.testing.assert_allclose(rates(jnp.asarray([0, 1, 3], jnp.int32)), [1e-2, 5e-3, 2.5e-3], rtol=1e-6)
+
+
+@pytest.mark.full
+def test_fear_alone_learns_faster_in_its_first_updates():
     made = program("mixed")
-    setup, plain = made.setup, made.hyper(fear_lr_start=0.0)
-    updates = jnp.asarray([0, 1, 3], jnp.int32)
-    rates = jax.vmap(lambda update: learner._annealed(setup, made.hyper(fear_lr_start=1e-2), update).fear_lr_start)
-    np.testing.assert_allclose(rates(updates), [1e-2, 5e-3, 2.5e-3], rtol=1e-6)
-    begin = made.init(plain, jax.random.key(0))
-    quick, rate = made.step(made.hyper(fear_lr_start=1e-2), begin)[0], setup.config.emotion_lr
-    slow, also_slow = (made.step(made.hyper(fear_lr_start=x), begin)[0] for x in (0.0, rate))
+    begin, rate = made.init(made.setup.hyper, jax.random.key(0)), made.setup.config.emotion_lr
+    quick, slow, also_slow, quick_for_all = (
+        made.step(made.hyper(**rates), begin)[0]
+        for rates in (
+            dict(fear_lr_start=1e-2),
+            dict(fear_lr_start=0.0),
+            dict(fear_lr_start=rate),
+            dict(fear_lr_start=0.0, emotion_lr=1e-2),
+        )
+    )
     chex.assert_trees_all_equal(slow, also_slow)
     chex.assert_trees_all_equal(quick.regret, slow.regret)
     with pytest.raises(AssertionError):
         chex.assert_trees_all_equal(quick.fear, slow.fear)
-    chex.assert_trees_all_equal(quick.fear, made.step(made.hyper(fear_lr_start=0.0, emotion_lr=1e-2), begin)[0].fear)
+    chex.assert_trees_all_equal(quick.fear, quick_for_all.fear)
 
 
 @pytest.mark.full

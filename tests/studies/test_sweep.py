@@ -67,6 +67,7 @@ def test_points_are_run_folders_and_nothing_else_is_left(swept: pathlib.Path):
         assert [(row["step"], row["seed"]) for row in rows(swept / name)[:3]] == [(200, 0), (200, 1), (400, 0)]
 
 
+@pytest.mark.full
 def test_a_point_is_the_same_run_alone_to_rounding(swept: pathlib.Path, alone: pathlib.Path):
     """XLA fuses differently where settings have a lane axis, so the last bits differ (3e-7 after 20 updates)."""
     expected, point = state(alone), state(swept / NAMES[0])

@@ -60,6 +60,7 @@ def test_only_warp_has_kernels(cli, tmp_path):
     assert code == 0 and " kernels ready" not in text
 
 
+@pytest.mark.full
 def test_training_starts_without_warps_private_places(cli, tmp_path, monkeypatch):
     def missing(env: object) -> list:
         raise AttributeError("no Module")
