@@ -1,11 +1,12 @@
-"""The `warp` engine: MJX with the MuJoCo-Warp implementation, for NVIDIA GPUs."""
+"""The `warp` engine: MuJoCo-Warp, for NVIDIA GPUs."""
 
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,30 +16,26 @@ import numpy as np
 
 from . import warp_kernels
 from .contract import PhysicsState, Readout, needs_post_constraint, rest_state
-from .mjx_engine import load_state, read_state
 from .mjx_patches import import_mjx
 
 
 class WarpEngine:
-    """MJX with the MuJoCo-Warp implementation. Its sums are atomic: runs do not repeat to the last bit.
+    """MuJoCo-Warp, whose kernels of a whole control step are one CUDA graph.
 
-    Buffers are sized by the model (`_room`) and the batch, and every step reports whether they were large enough.
+    MJX would make a foreign call of every substep and hand all of MuJoCo's arrays from one to the next. Here these
+    arrays stay in Warp, and XLA sees the state, the controls and the readouts. Sums are atomic: runs do not repeat to
+    the last bit. Buffers are sized by the model (`_room`) and the batch, and every step reports whether they sufficed.
     """
 
     name = "warp"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None):
-        mjx = import_mjx()
+        import_mjx()  # it brings MuJoCo-Warp, and prints where Warp is missing
         _quieten()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
-        settings = {"opt._impl.warn_overflow": 0}  # it would print from inside the kernels
-        settings |= {"ncam": 0, "nlight": 0}  # unused here, and each costs a kernel a stage
-        self._model = _constant(lambda: mjx.put_model(model, impl="warp").tree_replace(settings))
-        # Forces after the constraints are read at the end of a control step only; Warp works them out in each of the
-        # integrator's stages, so the substeps before the last go without.
-        forces = {"opt._impl.run_rne_postconstraint": needs_post_constraint(readout)}
-        self._last_model = self._model.tree_replace(forces)
+        self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
+        self._call: Any = None
         warp_kernels.engines.add(self)
 
     def start(self) -> PhysicsState:
@@ -54,44 +51,96 @@ class WarpEngine:
 
     def _step_all(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
         """One control step of a batch: all arrays have a leading [B]."""
-        mjx = import_mjx()
-        data = self._make_data(len(ctrl))
+        data = self._hold(len(ctrl))
+        outputs = {name: getattr(data, name) for name in self._fields()}
+        if self._call is None:
+            self._call = _foreign(self._advance, _INPUTS, outputs)
+        given = [x.astype(jnp.float32) for x in (state.qpos, state.qvel, state.warmstart, ctrl)]
+        results = self._call(*given, output_dims={f"new_{name}": array.shape for name, array in outputs.items()})
+        after = dict(zip(outputs, results, strict=True))
+        out = {name: after[field][:, index] for name, (field, index) in self._readout.items()}
+        out["overflow"] = ((after["overflow"] & _LOST) != 0).astype(jnp.float32)
+        return PhysicsState(after["qpos"], after["qvel"], after["qacc_warmstart"]), out
 
-        def one(state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
-            own = load_state(data, state, ctrl)
-            for _ in range(self._substeps - 1):
-                own = mjx.step(self._model, own)
-            own = mjx.step(self._last_model, own)
-            after, out = read_state(own, self._readout)
-            lost = (own._impl.overflow & _LOST) != 0
-            return after, out | {"overflow": lost.astype(after.qpos.dtype)}
+    def _fields(self) -> tuple[str, ...]:
+        """The arrays of Warp's data that a step returns."""
+        read = (field for field, _ in self._readout.values())
+        return tuple(dict.fromkeys(("qpos", "qvel", "qacc_warmstart", "overflow", *read)))
 
-        return jax.vmap(one)(state, ctrl)
+    def _hold(self, batch: int) -> Any:
+        """Warp's data for a batch on the devices that may step it; none can be made while a graph is captured."""
+        import warp
+
+        kind = jax.local_devices()[0].platform
+        places = warp.get_cuda_devices() if kind == "gpu" else [warp.get_device("cpu")]
+        for place in places:
+            if (place.alias, batch) not in self._held:
+                with warp.ScopedDevice(place):
+                    self._held[place.alias, batch] = self._make(batch)
+        return self._held[places[0].alias, batch][1]
+
+    def _make(self, batch: int) -> tuple[Any, Any]:
+        from mujoco.mjx.third_party import mujoco_warp
+
+        model = mujoco_warp.put_model(self._c_model)
+        model.opt.warn_overflow = 0  # it would print from inside the kernels
+        model.opt.tolerance.fill_(self._c_model.opt.tolerance)  # Warp would raise it to 1e-6
+        model.ncam = model.nlight = 0  # unused here, and each costs a kernel a stage
+        # Warp keeps the contacts of all worlds in one buffer, so its size depends on the batch.
+        size = self._contacts * batch
+        return model, mujoco_warp.make_data(self._c_model, nworld=batch, naconmax=size, njmax=self._rows)
+
+    def _advance(self, qpos: Any, qvel: Any, warmstart: Any, ctrl: Any, *outputs: Any) -> None:
+        """One control step, in Warp's arrays of the batch; on a GPU it is captured as a graph."""
+        import warp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        model, data = self._held[ctrl.device.alias, ctrl.shape[0]]
+        for mine, given in zip((data.qpos, data.qvel, data.qacc_warmstart, data.ctrl), (qpos, qvel, warmstart, ctrl)):
+            warp.copy(mine, given)
+        data.overflow.zero_()
+        for substep in range(self._substeps):
+            # Forces after the constraints are read at the end of a control step only; Warp works them out in each of
+            # the integrator's stages, so the substeps before the last go without.
+            last = substep == self._substeps - 1
+            model.opt.run_rne_postconstraint = last and needs_post_constraint(self._readout)
+            mujoco_warp.step(model, data)
+        for name, array in zip(self._fields(), outputs, strict=True):
+            warp.copy(array, getattr(data, name))
 
     def rehearse(self) -> None:
         """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
         from mujoco.mjx.third_party import mujoco_warp
 
-        model = mujoco_warp.put_model(self._c_model)
+        model, data = self._make(1)
         if model.opt.broadphase != mujoco_warp.BroadphaseType.NXN or model.nflex:
             return  # its sorts are no kernels of Warp's: they would run, on what no kernel has written
-        model.opt.warn_overflow, model.ncam, model.nlight = False, 0, 0
         model.opt.run_rne_postconstraint = needs_post_constraint(self._readout)
         model.opt.graph_conditional = False  # a loop in a graph asks the device when to end
-        data = mujoco_warp.make_data(self._c_model, nworld=1, naconmax=self._contacts, njmax=self._rows)
         mujoco_warp.step(model, data)
 
-    def _make_data(self, batch: int) -> Any:
-        """Warp keeps the contacts of all worlds in one buffer, so its size depends on the batch."""
-        mjx = import_mjx()
-        size = self._contacts * batch
-        data = _constant(lambda: mjx.make_data(self._c_model, impl="warp", naconmax=size, njmax=self._rows))
 
-        def slim(leaf: Any) -> Any:  # the empty buffers are uniform: keep them out of the program's constants
-            large = leaf.ndim > 0 and leaf.shape[0] == size and size > 1
-            return jnp.broadcast_to(leaf[:1], leaf.shape) if large else leaf
+_INPUTS = ("qpos", "qvel", "warmstart", "ctrl")
 
-        return jax.tree.map(slim, data)
+
+def _foreign(function: Callable[..., None], inputs: Sequence[str], outputs: Mapping[str, Any]) -> Any:
+    """`function(*inputs, *outputs)` of Warp's arrays as a function of JAX's: [B, ...] float32 in, like `outputs` out."""
+    import warp
+
+    kinds = {name: warp.array(dtype=float, ndim=2) for name in inputs}
+    kinds |= {f"new_{name}": warp.array(dtype=array.dtype, ndim=array.ndim) for name, array in outputs.items()}
+
+    def call(*arrays: Any) -> None:
+        function(*arrays)
+
+    # Warp reads names and types of the arguments from the signature.
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    parameters = [inspect.Parameter(name, kind, annotation=array) for name, array in kinds.items()]
+    call.__signature__, call.__annotations__ = inspect.Signature(parameters), kinds
+    on_gpu = jax.local_devices()[0].platform == "gpu"
+    # Warp captures the graph: XLA's own captures take no loops, which the solver has.
+    mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
+    return warp.jax_callable(call, num_outputs=len(outputs), graph_mode=mode)
 
 
 def _quieten() -> None:
@@ -100,16 +149,6 @@ def _quieten() -> None:
 
     asked = logging.getLogger(__name__).isEnabledFor(logging.INFO)
     warp.config.log_level = warp.LOG_INFO if asked else warp.LOG_WARNING
-
-
-def _constant(make: Callable[[], Any]) -> Any:
-    """What `make` builds of JAX arrays, as NumPy's, wherever it is called from.
-
-    MJX reads its arrays' shapes per shard, which are undefined inside a `shard_map`, so `make` runs outside of any
-    mesh. An array that lies on one device cannot be a constant of a program for several.
-    """
-    with jax.ensure_compile_time_eval(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-        return jax.tree.map(np.asarray, make())
 
 
 def _flattened(batched: Any) -> Any:

@@ -162,8 +162,7 @@ def _update_multiplier(
     if setup.method.constraint == "none":
         return multiplier
     if setup.method.constraint == "trust_region":
-        held = lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin) / setup.vector.horizon
-        return lagrangian.lowered_limit(multiplier, cost_excess, held, hyper.limit_lr, metrics["case"] == 0)
+        return lagrangian.lowered_limit(multiplier, cost_excess, hyper.limit_lr, metrics["reach"])
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
     excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)
@@ -292,5 +291,6 @@ def _trust_region_step(
         "entropy": distributions.entropy(std, rows.mask).mean(),
         "std": (std * rows.mask).sum() / rows.mask.sum(),
         "case": direction.case.astype(loss.dtype),
+        "reach": direction.reach,
         "line_search_steps": tried.astype(loss.dtype),
     }

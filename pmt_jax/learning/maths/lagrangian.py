@@ -55,26 +55,19 @@ def dual_update(
 
 
 def lowered_limit(
-    lowered: jax.Array,
-    cost_excess: jax.Array,
-    held: jax.Array | float,
-    limit_lr: jax.Array | float,
-    helpless: jax.Array,
+    lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, reach: jax.Array
 ) -> jax.Array:
     """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
 
-    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. If
-    the step already does nothing but lower the cost, the limit is not lowered further: it would have to rise again.
-    It is not lowered by more than the cost itself: what adds up while a policy is far beyond the limit would keep the
-    policy in recovery for good.
+    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where
+    the step can do no more than lower the cost, the sum moves towards what such a step promises instead
+    (anti-windup by back-calculation): more could not act, and it would delay the reward once the limit is kept.
 
     Args:
-      lowered: [...] so far, cost_excess: S [...], and held: [...], the limit d, all in cost per step;
-        helpless: [] or [...] bool, the step did nothing but lower the cost.
+      lowered: [...] so far, and cost_excess: S [...], in cost per step; reach: the most that a step promises to take
+        off the cost, in the same unit.
     """
-    step = limit_lr * cost_excess
-    lowered = lowered + jnp.where(helpless, jnp.minimum(step, 0.0), step)
-    return jnp.clip(lowered, 0.0, jnp.maximum(cost_excess + held, 0.0))
+    return jnp.maximum(lowered + limit_lr * jnp.minimum(cost_excess, reach - lowered), 0.0)
 
 
 def pid(

@@ -18,10 +18,12 @@ Hvp = Callable[[jax.Array], jax.Array]
 
 @pytree
 class Direction:
-    """step [P], and which of the five cases it came from (see `constrained_direction`)."""
+    """step [P], which of the five cases it came from (see `constrained_direction`), and `reach` [], the most that the
+    trust region can take off the cost, sqrt(2 delta b'H^-1 b), by the linear model."""
 
     step: jax.Array
     case: jax.Array
+    reach: jax.Array
 
 
 def conjugate_gradient(hvp: Hvp, b: jax.Array, iterations: int = 10, tolerance: float = 1e-10) -> jax.Array:
@@ -96,7 +98,7 @@ def constrained_direction(
     across = v - r / (s + EPS) * w
     optimal = jnp.where(nu > 0, -across / (lam + EPS) - c / (s + EPS) * w, -v / (lam + EPS))
     recovery = -jnp.sqrt(2 * delta / (s + EPS)) * w
-    return Direction(jnp.where(case == 0, recovery, optimal), case)
+    return Direction(jnp.where(case == 0, recovery, optimal), case, jnp.sqrt(2 * delta * jnp.maximum(s, 0.0)))
 
 
 def _dual(
