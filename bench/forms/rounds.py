@@ -117,7 +117,7 @@ def as_candidate_d(file: pathlib.Path) -> str:
 
 
 def as_fourth(file: pathlib.Path) -> str:
-    """Question b in the fourth round: its cells, those of one task and p beside MAPPO-L."""
+    """Cells of the fourth and the sixth round, those of one task and p beside MAPPO-L; question f has its own table."""
     found = [run for run in runs.load(file) if run["task"] != "ant_4x2"]
     groups = dict.fromkeys((run["task"], share(run)) for run in found)
     cells = [[run for run in found if (run["task"], share(run)) == group] for group in groups]
@@ -261,6 +261,11 @@ def as_beside_mappo_l(file: pathlib.Path) -> str:
     return beside([_first(runs.load(file), method="mappo_l")])
 
 
+def as_beside_f4sg(file: pathlib.Path) -> str:
+    """All cells of a file beside F4SG, at the last update that all of them reached."""
+    return beside([_first(runs.load(file), method="f4sg")])
+
+
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
@@ -327,8 +332,10 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "candidate_d": as_candidate_d,
     "fourth": as_fourth,
     "fifth": as_fifth,
+    "sixth": as_fourth,
     "power": as_power,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
     "beside_mappo_l": as_beside_mappo_l,
+    "beside_f4sg": as_beside_f4sg,
 }

@@ -162,7 +162,8 @@ def as_ran(files: pathlib.Path) -> str:
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
         line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
-        line += [f"{len(first['seeds'])} x {span}", f"{first['versions']['device']}, `{first['versions']['engine']}`"]
+        devices = " and ".join(dict.fromkeys(run["versions"]["device"] for run in found))
+        line += [f"{len(first['seeds'])} x {span}", f"{devices}, `{first['versions']['engine']}`"]
         body.append([*line, f"{max(run['seconds'] for run in found) / 60:.1f}", f"{sum(kept)} of {len(kept)}"])
     return markdown(head, body)
 
