@@ -10,7 +10,8 @@ from pmt_jax import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.tasks import did_you_mean
 
-Kind = Literal["plain loop", "environment", "training", "start", "checkpoint", "power flow", "baseline", "certificate"]
+Timed = Literal["plain loop", "environment", "training", "power flow"]
+Kind = Timed | Literal["start", "checkpoint", "baseline", "certificate", "substep"]
 Settings = tuple[tuple[str, Any], ...]
 
 
@@ -20,7 +21,8 @@ class Case:
 
     Attributes:
       kind: a plain Python loop over C MuJoCo; the environment alone under random actions; the whole training loop;
-        the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned.
+        the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned; the kernels of an
+        integration step.
       task: an environment, or a network for power flows.
       what: which start, tool, policy or walls.
       method, physics, solver: of training and of the engine; the task's own if left out.
@@ -257,6 +259,12 @@ BENCHES = {
         _alone("voltage_33", (64,), 60),
         on="gpu",
         by_turns=False,
+    ),
+    "substep": Bench(
+        "GPU: seconds of one integration step of the ant, solver iterations, and its slowest kernels",
+        tuple(Case("substep", "ant_2x4", num_envs=count) for count in (512, 2048, 16_384)),
+        (Case("substep", "ant_2x4", num_envs=64),),
+        on="gpu",
     ),
     "loop": Bench(
         "GPU: environment steps/s of the whole training loop per method and size; memory, GB; share of time busy",

@@ -27,7 +27,7 @@ from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
 
-from . import grid, once, plain
+from . import grid, once, plain, substep
 from .cases import Bench, Build, Case, Program
 from .records import Row
 
@@ -171,6 +171,7 @@ ONCE = {
     "checkpoint": once.checkpoint,
     "baseline": once.baseline,
     "certificate": once.certificate,
+    "substep": substep.substep,
 }
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 

@@ -19,7 +19,7 @@ from pmt_jax.studies.statistics import difference_interval, holm, iqm, iqm_inter
 
 from .. import records
 from . import runs
-from .tables import markdown
+from .tables import markdown, matching
 
 Scores = NDArray[np.float64]  # [seeds]
 
@@ -251,6 +251,24 @@ def as_why(file: pathlib.Path) -> str:
     return markdown(head, body)
 
 
+def as_noise(file: pathlib.Path) -> str:
+    """Noise of the cost advantage with the critic's values set aside: of felt costs and of fear, a row for each p.
+
+    Means and standard deviations over seeds; docs/figures/noise.py defines the measures.
+    """
+    rows = records.load(file)[file.stem]["rows"]
+
+    def cell(p: float, measure: str, signal: str) -> str:
+        seeds = np.array([row[measure] for row in matching(rows, p=p, signal=signal, values="zero")])
+        return f"{seeds.mean():.2f} +- {seeds.std(ddof=1):.2f}"
+
+    columns = [(measure, signal) for measure in ("noise_share", "correlation") for signal in ("cost", "fear")]
+    shares = dict.fromkeys(row["p"] for row in rows)
+    head = ["p", "noise share, felt cost", "noise share, fear"]
+    head += ["correlation with the advantage of the true cost, felt cost", "the same, fear"]
+    return markdown(head, [[f"{p:g}", *(cell(p, *column) for column in columns)] for p in shares])
+
+
 def mean_sd(x: Scores) -> str:
     form = ".0f" if abs(x.mean()) >= 100 else ".1f"
     return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
@@ -266,5 +284,6 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "equivalence": as_equivalence,
     "weights": as_weights,
     "why": as_why,
+    "noise": as_noise,
     "headline": as_headline,
 }

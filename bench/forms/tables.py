@@ -160,6 +160,11 @@ def _sizes(*names: str) -> Callable[[Row, Rows], str]:
     return lambda row, rows: " x ".join(f"{row[name]:,}" for name in names if name in row) or "-"
 
 
+def _of_a_call_a_substep(row: Row, rows: Rows) -> float | None:
+    same = {name: row.get(name) for name in ("kind", "task", "seeds", "num_envs")}
+    return _over(row, rows, what="a substep", **same)
+
+
 def _ours_cell(row: Row, rows: Rows) -> str:
     found = _ours(row, rows) if row["what"] != "ours f32" else []
     lowest = f" ({min(found):,.2f})" if len(found) > 1 else ""
@@ -223,6 +228,14 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "save, s": _shown("{:.2f}", "save_seconds"),
     "load, s": _shown("{:.2f}", "load_seconds"),
     "share of wall time": _shown("{:.2%}", "overhead"),
+    "measured": _shown("{}", "kind"),
+    "a foreign call is": _shown("{}", "what"),
+    "of a call a substep": _shown("{:.2f}", _of_a_call_a_substep),
+    "substep, ms": _shown("{:.2f}", lambda row, rows: 1000 * row["substep_seconds"]),
+    "with one solver iteration, ms": _shown("{:.2f}", lambda row, rows: 1000 * row["one_iteration_seconds"]),
+    "launches": _shown("{}", "launches"),
+    "microseconds a launch": _shown("{:.1f}", lambda row, rows: 1e6 * row["substep_seconds"] / row["launches"]),
+    "solver iterations, mean and most": lambda row, rows: f"{row['iterations_mean']:.1f}, {row['iterations_most']}",
 }
 
 
@@ -241,6 +254,14 @@ class Table(NamedTuple):
     def _of(self, rows: Rows) -> str:
         shown = [row for row in rows if row["kind"] in self.kinds]
         return markdown(self.columns, ([COLUMNS[name](row, rows) for name in self.columns] for row in shown))
+
+
+def slowest(reports: Reports) -> str:
+    """The kernels of a substep that take longest, of the middle size, timed one by one."""
+    (report,) = (report for name, report in reports.items() if name.startswith("substep"))
+    row = sorted(report["rows"], key=lambda row: row["num_envs"])[len(report["rows"]) // 2]
+    body = [[f"`{name}`", str(count), f"{ms:.2f}"] for name, count, ms in row["slowest"]]
+    return markdown(("kernel", "launches a substep", f"milliseconds of all, {row['num_envs']:,} environments"), body)
 
 
 def hub(reports: Reports) -> str:
@@ -370,6 +391,20 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     ),
     "engines": Table(
         "engines", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s", "compile, s")
+    ),
+    "substep": Table(
+        "substep",
+        ("substep",),
+        (
+            *("environments", "substep, ms", "with one solver iteration, ms", "solver iterations, mean and most"),
+            *("launches", "microseconds a launch"),
+        ),
+    ),
+    "slowest_kernels": slowest,
+    "foreign_calls": Table(
+        "foreign_calls",
+        ("environment", "training"),
+        ("task", "measured", "a foreign call is", SIZES, "environment steps/s", "of a call a substep", "compile, s"),
     ),
     "loop": Table(
         "loop",

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import inspect
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -36,6 +37,7 @@ class WarpEngine:
         self._contacts, self._rows = _room(model, contacts)
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
         self._call: Any = None
+        self._stepping = threading.Lock()  # devices may call at once, and the CPU's share their data
         warp_kernels.engines.add(self)
 
     def start(self) -> PhysicsState:
@@ -96,17 +98,23 @@ class WarpEngine:
         from mujoco.mjx.third_party import mujoco_warp
 
         model, data = self._held[ctrl.device.alias, ctrl.shape[0]]
-        for mine, given in zip((data.qpos, data.qvel, data.qacc_warmstart, data.ctrl), (qpos, qvel, warmstart, ctrl)):
-            warp.copy(mine, given)
-        data.overflow.zero_()
-        for substep in range(self._substeps):
-            # Forces after the constraints are read at the end of a control step only; Warp works them out in each of
-            # the integrator's stages, so the substeps before the last go without.
-            last = substep == self._substeps - 1
-            model.opt.run_rne_postconstraint = last and needs_post_constraint(self._readout)
-            mujoco_warp.step(model, data)
-        for name, array in zip(self._fields(), outputs, strict=True):
-            warp.copy(array, getattr(data, name))
+        with self._stepping:
+            for mine, given in (
+                (data.qpos, qpos),
+                (data.qvel, qvel),
+                (data.qacc_warmstart, warmstart),
+                (data.ctrl, ctrl),
+            ):
+                warp.copy(mine, given)
+            data.overflow.zero_()
+            for substep in range(self._substeps):
+                # Forces after the constraints are read at the end of a control step only; Warp works them out in each
+                # of the integrator's stages, so the substeps before the last go without.
+                last = substep == self._substeps - 1
+                model.opt.run_rne_postconstraint = last and needs_post_constraint(self._readout)
+                mujoco_warp.step(model, data)
+            for name, array in zip(self._fields(), outputs, strict=True):
+                warp.copy(array, getattr(data, name))
 
     def rehearse(self) -> None:
         """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
@@ -124,7 +132,7 @@ _INPUTS = ("qpos", "qvel", "warmstart", "ctrl")
 
 
 def _foreign(function: Callable[..., None], inputs: Sequence[str], outputs: Mapping[str, Any]) -> Any:
-    """`function(*inputs, *outputs)` of Warp's arrays as a function of JAX's: [B, ...] float32 in, like `outputs` out."""
+    """`function(*inputs, *outputs)` of Warp's arrays as one of JAX's: [B, ...] float32 in, like `outputs` out."""
     import warp
 
     kinds = {name: warp.array(dtype=float, ndim=2) for name in inputs}

@@ -33,6 +33,21 @@ def answer(name: str, command: Callable[[], int]) -> int:
         return 141
     except OSError as error:  # a path that is too long, a folder that may not be read, a full disk
         return _refuse(name, f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+    except RuntimeError as error:
+        if not _is_out_of_memory(error):
+            raise
+        return _refuse(name, f"{str(error).splitlines()[0].removeprefix(_NO_MEMORY)}; {_LESS}")
+
+
+_NO_MEMORY = "RESOURCE_EXHAUSTED: "
+_LESS = (
+    "other programs may share the device: take fewer of them (--jobs), or a smaller num_envs, rollout_length or seeds"
+)
+
+
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    """Whether XLA found no memory for a program; JAX, which defines its errors, is not imported for other commands."""
+    return type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and str(error).startswith(_NO_MEMORY)
 
 
 def _refuse(name: str, sentence: str) -> int:

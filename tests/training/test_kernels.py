@@ -109,4 +109,4 @@ def test_a_rehearsed_step_compiles_nothing_and_prints_nothing(task: str, tmp_pat
     assert done.returncode == 0, done.stderr
     assert "Module" not in done.stdout
     count, late = json.loads(done.stdout.splitlines()[-1])
-    assert count > 20 and set(late) <= {"mujoco.mjx.warp.ffi"}  # which has none, and is read while tracing
+    assert count > 20 and set(late) <= {"envs.physics.warp_engine"}  # which has none, and is read while tracing

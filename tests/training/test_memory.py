@@ -5,9 +5,10 @@ from __future__ import annotations
 import pathlib
 from types import SimpleNamespace
 
+import jax
 import pytest
 
-from pmt_jax.training import compile
+from pmt_jax.training import compile, trainer
 
 
 @pytest.mark.parametrize(
@@ -23,6 +24,26 @@ def test_what_cannot_fit_is_refused(flags, says, cli, monkeypatch, tmp_path: pat
     code, _, err = cli("train", "lane", "--steps", "1e6", *flags, "--out", tmp_path / "x")
     assert code == 2 and says in err and err.count("\n") == 1
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    "message", ["RESOURCE_EXHAUSTED: Out of memory while trying to allocate 5.71GiB", "INTERNAL: x"]
+)
+def test_a_device_without_room_gets_a_sentence(message: str, cli, monkeypatch, tmp_path: pathlib.Path):
+    """A GPU that other programs share may have no room left although the run alone would fit."""
+
+    def full(*_: object, **__: object) -> None:
+        raise jax.errors.JaxRuntimeError(message)
+
+    monkeypatch.setattr(trainer.Trainer, "train", full)
+    arguments = ("train", "lane", "--steps", "1e4", "--out", tmp_path / "x")
+    if message.startswith("INTERNAL"):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
+            cli(*arguments)
+        return
+    code, _, err = cli(*arguments)
+    assert code == 2 and err.count("\n") == 1
+    assert err.startswith("pmt: Out of memory while trying to allocate 5.71GiB; other programs may share the device")
 
 
 @pytest.mark.parametrize("chosen", ["", "relative", None])
