@@ -55,9 +55,6 @@ def make_mesh(config: Config, count: int | None) -> Mesh | None:
         return None
     seeds = math.gcd(config.seeds, count)
     _check_even(config, count, seeds)
-    # MJX-Warp has many constants without entries. As inputs of a `per_device` function they crash XLA's partitioner
-    # (jaxlib 0.11.2); so constants stay where they are used.
-    jax.config.update("jax_use_simplified_jaxpr_constants", True)
     axes = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((seeds, count // seeds), (SEED, ENV), axes, devices=present[:count])
 
