@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import pathlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -180,7 +180,27 @@ def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
 
 def as_equivalence(file: pathlib.Path) -> str:
     """Question c, first part: R4SG less MAPPO-L at p = 1, beside half of MAPPO-L's standard deviation."""
-    cells = {run["method"]: measures(run) for run in runs.load(file) if share(run) == 1}
+    return _equivalence({run["method"]: measures(run) for run in runs.load(file) if share(run) == 1})
+
+
+def as_equivalence_pooled(files: pathlib.Path) -> str:
+    """Question c on the grid under noise: all seeds of several rounds with the same settings; a + joins files."""
+    found = [run for name in files.stem.split("+") for run in runs.load(files.with_stem(name))]
+    usual = {"cost_seen": 0.05, "lambda_lr": 12.0, "lambda_init": 0.78, "lambda_kp": 0.0}
+    usual |= {"lr_half_life": np.inf, "regret_response": "letter", "kappa": 0.5, "surrogate_weight": 1.0}
+    cells: dict[str, dict[str, Scores]] = {}
+    seeds = []  # how many of each method
+    for method in ("mappo_l", "r4sg"):
+        wanted = usual | {"method": method}
+        same = [run for run in found if run["task"] == "voltage_33" and settings(run).items() >= wanted.items()]
+        scores = [measures(run) for run in same]
+        cells[method] = {name: np.concatenate([x[name] for x in scores]) for name in scores[0]}
+        seeds.append(f"{len(cells[method]['end'])} of {NAMES[method]}")
+    return f"{' and '.join(seeds)}:\n\n{_equivalence(cells)}"
+
+
+def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
+    """R4SG less MAPPO-L in each measure, with what it says."""
     body = []
     for name, measure in {"reward": "reward", "true cost at the end": "end", "true cost, training": "training"}.items():
         middle, half = welch(cells["r4sg"][measure], cells["mappo_l"][measure], level=0.9)
@@ -189,7 +209,7 @@ def as_equivalence(file: pathlib.Path) -> str:
         p = u_test(cells["r4sg"][measure], cells["mappo_l"][measure])
         answer = "equivalent" if inside else "different" if p < 0.05 else "not told apart"
         body.append(
-            [name, f"{middle:+.1f} [{middle - half:.1f}, {middle + half:.1f}]", f"+- {bound:.1f}", p_value(p), answer]
+            [name, f"{middle:+.2f} [{middle - half:.2f}, {middle + half:.2f}]", f"+- {bound:.2f}", p_value(p), answer]
         )
     return markdown(["measure", "R4SG less MAPPO-L [90 %]", "bounds", "p", "answer"], body)
 
@@ -282,6 +302,7 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "study": as_study,
     "lag": as_lag,
     "equivalence": as_equivalence,
+    "equivalence_pooled": as_equivalence_pooled,
     "weights": as_weights,
     "why": as_why,
     "noise": as_noise,

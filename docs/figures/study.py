@@ -1,4 +1,5 @@
-"""Draws docs/study.png: true cost and reward at the end against how seldom harm is felt, from bench/results.
+"""Draws docs/study.png, true cost and reward at the end against how seldom harm is felt, and docs/study_curves.png,
+the same over training at p = 0.03; from bench/results.
 
 python -m docs.figures.study
 """
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from bench import records
 from bench.forms import runs, study
@@ -87,6 +89,45 @@ def _line(axis: Any, cells: list[runs.Run], name: str) -> None:
                 axis.annotate(text, (x, y), xytext, color=colour, fontweight="bold", **at)
 
 
+CURVES = {"true_episode_cost": PANELS["end"], "episode_reward": PANELS["reward"]}
+
+
+def draw_curves(found: list[runs.Run], file: pathlib.Path, seen: float = 0.03) -> None:
+    """Two panels of the cells of one p, lambda from 2: means over seeds while training, bands of one deviation."""
+    cells = [run for run in found if study.share(run) == seen and study.settings(run)["lambda_init"] == 2]
+    with rc_context(style.FONT):
+        figure = Figure(figsize=(10, 4.4), layout="constrained")
+        for axis, (name, title) in zip(figure.subplots(1, 2), CURVES.items(), strict=True):
+            ends = [_curve(axis, run, name) for run in cells]
+            axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
+            axis.set_xlabel("environment steps of a seed")
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axis.set_xlim(0, max(run["steps"][-1] for run in cells))
+            if name == "true_episode_cost":
+                axis.set(yscale="log", ylim=(3, 500))
+                axis.set_yticks([3, 10, 30, 100, 300], ["3", "10", "30", "100", "300"])
+                axis.axhline(10, color=INK, lw=1.2, ls="--")
+                style.name_limit(axis, 10)
+            style.label_lines(axis, ends)
+        seeds, share = len(cells[0]["seeds"]), f"a costly step is felt with probability {seen:g}"
+        title = f"ant_2x4, {share}: mean of {seeds} seeds, band: standard deviation"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        figure.savefig(file, dpi=110)
+
+
+def _curve(axis: Any, run: runs.Run, name: str) -> tuple[str, float]:
+    """Draws a cell's mean over seeds and its band; returns the method and where the line ends."""
+    steps, values = np.array(run["steps"]), np.array(run[name], float)
+    known = np.isfinite(values).all(0)
+    mean, spread = values[:, known].mean(0), values[:, known].std(0, ddof=1)
+    colour = METHOD_COLOURS[run["method"]]
+    axis.plot(steps[known], mean, color=colour, lw=2)
+    axis.fill_between(steps[known], np.maximum(mean - spread, 0.0), mean + spread, color=colour, alpha=0.15, lw=0)
+    return run["method"], float(mean[-1])
+
+
 if __name__ == "__main__":
-    draw(runs.load(records.RESULTS / "study_ant_2x4_h200.json"), DOCS / "study.png")
-    print("docs/study.png")
+    cells = runs.load(records.RESULTS / "study_ant_2x4_h200.json")
+    draw(cells, DOCS / "study.png")
+    draw_curves(cells, DOCS / "study_curves.png")
+    print("docs/study.png and docs/study_curves.png")
