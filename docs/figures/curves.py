@@ -47,11 +47,12 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
     with rc_context(style.FONT):
         figure = Figure(figsize=(10, 4.2), layout="constrained")
         for axis, (name, title) in zip(figure.subplots(1, 2), panels.items(), strict=True):
-            ends = [_line(axis, group, name, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
+            last = max(int(run.steps[-1]) for group in shown for run in group.runs)
+            ends = [_line(axis, group, name, last, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
             axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
             axis.set_xlabel("environment steps of a seed")
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axis.set_xlim(0, max(int(run.steps[-1]) for group in shown for run in group.runs))
+            axis.set_xlim(0, last)
             if name == "episode_cost":
                 plot.cost_axis(axis, shown, name)
                 axis.set_ylabel("linear up to the limit, then log" if axis.get_yscale() == "symlog" else "")
@@ -65,13 +66,15 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
         figure.savefig(file, dpi=110)
 
 
-def _line(axis: Any, group: Group, name: str, banded: bool) -> tuple[str, float]:
-    """Draws a method's mean over seeds; returns where it ends."""
+def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[str, float]:
+    """Draws a method's mean over seeds, dotted from where it stopped early to the `last` step; returns where it ends."""
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))
     colour = plot.METHOD_COLOURS[group.method]
     axis.plot(steps[known], mean, color=colour, lw=2)
+    if steps[known][-1] < 0.98 * last:
+        axis.hlines(mean[-1], steps[known][-1], last, color=colour, lw=1, ls=":")
     if banded:
         axis.fill_between(steps[known], low, high, color=colour, alpha=0.18, lw=0)
     return group.method, float(mean[-1])

@@ -74,7 +74,7 @@ def _add_compare(commands: Any) -> None:
         run_compare,
         "compare two runs of one task: pmt compare runs/f4sg runs/mappo_l -o curves.png",
         description="Reward, cost and seeds within the limit: difference of means and probability of improvement, "
-        "each with its 95 %% interval over seeds.",
+        "each with its 95-percent interval over seeds.",
     )
     for name in ("first", "second"):
         run = "a run folder, or a folder of runs that differ only in their seeds"
