@@ -67,7 +67,7 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
 
 
 def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[str, float]:
-    """Draws a method's mean over seeds, dotted from where it stopped early to the `last` step; returns where it ends."""
+    """Draws a method's mean over seeds, dotted to the `last` step if it stopped early; returns where it ends."""
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))

@@ -73,8 +73,7 @@ class WarpEngine:
         """Warp's data for a batch on the devices that may step it; none can be made while a graph is captured."""
         import warp
 
-        kind = jax.local_devices()[0].platform
-        places = warp.get_cuda_devices() if kind == "gpu" else [warp.get_device("cpu")]
+        places = warp_kernels.places()
         for place in places:
             if (place.alias, batch) not in self._held:
                 with warp.ScopedDevice(place):
@@ -145,9 +144,8 @@ def _foreign(function: Callable[..., None], inputs: Sequence[str], outputs: Mapp
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(name, kind, annotation=array) for name, array in kinds.items()]
     call.__signature__, call.__annotations__ = inspect.Signature(parameters), kinds
-    on_gpu = jax.local_devices()[0].platform == "gpu"
     # Warp captures the graph: XLA's own captures take no loops, which the solver has.
-    mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
+    mode = warp.JaxCallableGraphMode.WARP if warp_kernels.places()[0].is_cuda else warp.JaxCallableGraphMode.NONE
     return warp.jax_callable(call, num_outputs=len(outputs), graph_mode=mode)
 
 
