@@ -7,6 +7,7 @@ imports neither JAX nor MuJoCo.
 from __future__ import annotations
 
 import functools
+import importlib.machinery
 import importlib.util
 import inspect
 import pathlib
@@ -69,11 +70,19 @@ def factory(name: str) -> Callable[..., Env]:
     return envs[0]
 
 
+class _Loader(importlib.machinery.SourceFileLoader):
+    """Reads a user's file and leaves no bytecode in the user's folder."""
+
+    def set_data(self, path: Any, data: Any, *, _mode: int = 0o666) -> None:
+        del path, data, _mode
+
+
 @functools.lru_cache(maxsize=16)
 def _module(file: pathlib.Path, changed: int) -> types.ModuleType:
     """Runs `file`, anew only when it has `changed`."""
     del changed
-    spec = importlib.util.spec_from_file_location(f"pmt_user_env_{file.stem}", file)
+    name = f"pmt_user_env_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file, loader=_Loader(name, str(file)))
     assert spec and spec.loader  # a .py file has both
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up

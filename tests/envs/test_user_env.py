@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
+import sys
 
 import pytest
 
@@ -30,6 +31,14 @@ TINY = (
 
 def test_the_example_is_short():
     assert len(EXAMPLE.read_text().splitlines()) <= 60
+
+
+def test_reading_a_file_leaves_nothing_beside_it(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)  # as on most machines
+    file = tmp_path / "mine.py"
+    file.write_text(EXAMPLE.read_text())
+    assert envs.make(str(file)).spec.num_agents > 0
+    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.full
