@@ -1,6 +1,7 @@
 """How noisy the cost advantage of a policy update is: of felt costs and of fear, by how seldom a cost is felt.
 
     python -m docs.figures.noise    trains, measures and writes bench/results/advantage_noise.json (15 minutes)
+    python -m docs.figures.noise --updates 60 --json bench/results/advantage_noise_later.json    (26 minutes)
 
 For each p and seed, F4SG trains for 30 updates on the CPU. Then the policy collects one batch. Its true costs are
 thinned 32 times: a costly step is felt with probability p. Each thinning has two cost advantages. Both come from the

@@ -57,7 +57,7 @@ STATED: dict[str, dict[str, str]] = {
         "tolerances": "1e-8 1e-5",
         "loops and evaluations of a probe on the CPU": "1051 1048 236",
     },
-    "results/study.md": {"thinnings": "32"},
+    "results/study.md": {"thinnings": "32", "updates": "60"},
     "results/study_fourth.md": {
         "two seeds and the median in the stored runs": "71 88 53",
         "medians of 80 seeds in the stored runs": "52.8 53.2",
