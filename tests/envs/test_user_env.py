@@ -59,7 +59,7 @@ def test_train_resume_and_evaluate_the_example(tmp_path: pathlib.Path, cli, monk
 
 @pytest.mark.full
 def test_training_stops_where_the_physics_lost_contacts(tmp_path: pathlib.Path, cli):
-    """As MJX-Warp says it did where its buffers were too small; here from the fourth control step on."""
+    """As `warp` says it did where its buffers were too small; here from the fourth control step on."""
     (tmp_path / "lossy.py").write_text(
         "import dataclasses\nfrom envs.toys import Lane\n\nclass Lossy(Lane):\n    def __init__(self):\n"
         "        super().__init__()\n"
