@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from envs.ant.walls import model
+from envs.physics.warp_engine import WarpEngine
 
 from .cases import Case
 from .records import Row
 
-CONTACTS, ROWS = 30, 112  # room for so many of a world
 WARM, REPEATS, TURNS = 20, 40, 5
 SLOWEST = 12  # kernels in a row
 
@@ -58,14 +58,9 @@ def kernels(launches: list[tuple[str, float]]) -> Row:
 
 
 def _worlds(count: int) -> tuple[Any, Any]:
-    """Warp's model and data of so many ants, in the air and on the ground, with random controls."""
-    from mujoco.mjx.third_party import mujoco_warp
-
+    """The engine's model and data of so many ants, in the air and on the ground, with random controls."""
     ant = model()
-    physics = mujoco_warp.put_model(ant)
-    physics.opt.warn_overflow = physics.ncam = physics.nlight = 0
-    physics.opt.tolerance.fill_(ant.opt.tolerance)
-    data = mujoco_warp.make_data(ant, nworld=count, naconmax=CONTACTS * count, njmax=ROWS)
+    physics, data = WarpEngine(ant, 1, {}).worlds(count)
     draw = np.random.default_rng(0)
     qpos = np.tile(ant.qpos0, (count, 1))
     qpos[:, 2] = draw.uniform(0.3, 0.8, count)

@@ -26,6 +26,7 @@ from .study import (
     mean_sd,
     measures,
     p_value,
+    pooled,
     settings,
     share,
     unsafe,
@@ -127,11 +128,11 @@ def as_fourth(file: pathlib.Path) -> str:
 def as_fifth(file: pathlib.Path) -> str:
     """Question b in the fifth round: criterion 1 on the grid, over the seeds of the fourth round and of this one."""
     rounds = [runs.load(file.with_name("study_fourth_h200.json")), runs.load(file)]
-    pooled = []
-    for cell in ({"method": "f4sg", **D}, {"method": "mappo_l"}):
-        scores = [_read([_cell(found, "voltage_33", 1.0, **cell)])[0] for found in rounds]
-        pooled.append({name: np.concatenate([x[name] for x in scores]) for name in MEASURES})
-    return _as_criteria([_lag("voltage_33", *pooled)], "candidate D, 80 seeds")
+    candidate, base = (
+        pooled([_read([_cell(found, "voltage_33", 1.0, **cell)])[0] for found in rounds])
+        for cell in ({"method": "f4sg", **D}, {"method": "mappo_l"})
+    )
+    return _as_criteria([_lag("voltage_33", candidate, base)], "candidate D, 80 seeds")
 
 
 def as_power(file: pathlib.Path) -> str:

@@ -57,6 +57,11 @@ def measures(run: runs.Run, until: float = np.inf) -> dict[str, Scores]:
     }
 
 
+def pooled(rounds: Sequence[dict[str, Scores]]) -> dict[str, Scores]:
+    """The measures of the seeds of several rounds together."""
+    return {name: np.concatenate([scores[name] for scores in rounds]) for name in rounds[0]}
+
+
 def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
     """The method, with the settings in which the runs of `among` differ."""
     name = NAMES[run["method"]]
@@ -193,8 +198,7 @@ def as_equivalence_pooled(files: pathlib.Path) -> str:
     for method in ("mappo_l", "r4sg"):
         wanted = usual | {"method": method}
         same = [run for run in found if run["task"] == "voltage_33" and settings(run).items() >= wanted.items()]
-        scores = [measures(run) for run in same]
-        cells[method] = {name: np.concatenate([x[name] for x in scores]) for name in scores[0]}
+        cells[method] = pooled([measures(run) for run in same])
         seeds.append(f"{len(cells[method]['end'])} of {NAMES[method]}")
     return f"{' and '.join(seeds)}:\n\n{_equivalence(cells)}"
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from bench import records
 from bench.forms import runs
@@ -49,10 +48,7 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
         for axis, (name, title) in zip(figure.subplots(1, 2), panels.items(), strict=True):
             last = max(int(run.steps[-1]) for group in shown for run in group.runs)
             ends = [_line(axis, group, name, last, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
-            axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
-            axis.set_xlabel("environment steps of a seed")
-            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axis.set_xlim(0, last)
+            style.over_steps(axis, title, last)
             if name == "episode_cost":
                 plot.cost_axis(axis, shown, name)
                 axis.set_ylabel("linear up to the limit, then log" if axis.get_yscale() == "symlog" else "")

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from bench import records
 from bench.forms import runs, study
@@ -99,10 +98,7 @@ def draw_curves(found: list[runs.Run], file: pathlib.Path, seen: float = 0.03) -
         figure = Figure(figsize=(10, 4.4), layout="constrained")
         for axis, (name, title) in zip(figure.subplots(1, 2), CURVES.items(), strict=True):
             ends = [_curve(axis, run, name) for run in cells]
-            axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
-            axis.set_xlabel("environment steps of a seed")
-            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axis.set_xlim(0, max(run["steps"][-1] for run in cells))
+            style.over_steps(axis, title, max(run["steps"][-1] for run in cells))
             if name == "true_episode_cost":
                 axis.set(yscale="log", ylim=(3, 500))
                 axis.set_yticks([3, 10, 30, 100, 300], ["3", "10", "30", "100", "300"])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import EngFormatter
 
 from bench.forms import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
@@ -36,6 +37,14 @@ def label_lines(axis: Any, ends: Sequence[tuple[str, float]]) -> None:
         colour = METHOD_COLOURS[method]
         axis.plot([1.0, 1.04], [height, place], transform=axis.transAxes, color=colour, lw=0.8, clip_on=False)
         axis.text(1.05, place, NAMES[method], transform=axis.transAxes, color=colour, va="center", fontweight="bold")
+
+
+def over_steps(axis: Any, title: str, last: int) -> None:
+    """A panel of curves while training, to the `last` step of a seed."""
+    axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
+    axis.set_xlabel("environment steps of a seed")
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis.set_xlim(0, last)
 
 
 def name_limit(axis: Any, limit: float) -> None:

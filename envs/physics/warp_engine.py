@@ -77,10 +77,11 @@ class WarpEngine:
         for place in places:
             if (place.alias, batch) not in self._held:
                 with warp.ScopedDevice(place):
-                    self._held[place.alias, batch] = self._make(batch)
+                    self._held[place.alias, batch] = self.worlds(batch)
         return self._held[places[0].alias, batch][1]
 
-    def _make(self, batch: int) -> tuple[Any, Any]:
+    def worlds(self, batch: int) -> tuple[Any, Any]:
+        """Warp's model, and its data for so many worlds, on Warp's current device."""
         from mujoco.mjx.third_party import mujoco_warp
 
         model = mujoco_warp.put_model(self._c_model)
@@ -119,7 +120,7 @@ class WarpEngine:
         """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
         from mujoco.mjx.third_party import mujoco_warp
 
-        model, data = self._make(1)
+        model, data = self.worlds(1)
         if model.opt.broadphase != mujoco_warp.BroadphaseType.NXN or model.nflex:
             return  # its sorts are no kernels of Warp's: they would run, on what no kernel has written
         model.opt.run_rne_postconstraint = needs_post_constraint(self._readout)

@@ -17,7 +17,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, records, render, runner
+from bench import compare, measure, once, records, render, runner, substep
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.forms import pages, runs, tables
@@ -230,6 +230,15 @@ def test_a_table_for_each_device_and_a_failure_in_it():
 @pytest.mark.parametrize("path", render.documents(), ids=lambda path: path.name)
 def test_documents_show_the_committed_results(path: pathlib.Path):
     assert render.render(path.read_text(), records.load()) == path.read_text(), "run python -m bench render"
+
+
+def test_kernels_are_ranked_by_the_time_of_all_their_launches():
+    launches = [("memset", 0.5), ("forward kernel _crb_073a11b8", 0.25), ("forward kernel _crb_073a11b8", 0.5)]
+    launches += [("forward kernel _search__locals__kernel_c6eeed5b", 0.125)]
+    assert substep.kernels(launches) == {
+        "launches": 4,
+        "slowest": [["_crb", 2, 0.75], ["memset", 1, 0.5], ["_search", 1, 0.125]],
+    }
 
 
 def test_every_result_is_used_by_a_page_or_a_test():
