@@ -33,6 +33,9 @@ class WarpEngine:
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None):
         import_mjx()  # it brings MuJoCo-Warp, and prints where Warp is missing
         _quieten()
+        from . import warp_contacts
+
+        warp_contacts.install()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch

@@ -20,6 +20,7 @@ NAMES = [f"velocity_{variant}" for variant in VARIANTS]
 PLACES = ("torso_xpos", "com")  # what `restore` takes beside qpos, of the robots that have it
 # engine -> largest error of qpos, qvel, reward, obs; share of rows that may be over
 TOLERANCES = {"mujoco": (2e-5, 5e-4, 5e-4, 1e-3, 0.002), "mjx": (5e-5, 5e-3, 1e-3, 2e-3, 0.01)}
+TOLERANCES["warp"] = TOLERANCES["mujoco"]
 EDGE = 1e-4  # m/s to the threshold, within which float32 may decide either way
 MJX = {"velocity_hopper_3x1", "velocity_swimmer_2x1"}
 PARTITIONED = {"velocity_ant_4x2", "velocity_half_cheetah_6x1"}  # the robots of other tasks, shared out otherwise
@@ -86,6 +87,12 @@ def test_reproduces_the_recorded_steps(name):
 )
 def test_reproduces_the_recorded_steps_on_mjx(name):
     check_replay(name, "mjx")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", NAMES)
+def test_reproduces_the_recorded_steps_on_warp(name):
+    check_replay(name, "warp")
 
 
 @each()
@@ -186,6 +193,7 @@ def test_raw_observations_are_the_state_and_who_observes():
     np.testing.assert_array_equal(state.obs, np.c_[np.tile(state.global_state, (2, 1)), np.eye(2)])
 
 
+@pytest.mark.full
 def test_resets_draw_what_the_tasks_say():
     for name, qpos_noise, qvel_noise in (("swimmer_2x1", 0.1, 0.1), ("hopper_3x1", 0.005, 0.005)):
         env, *_ = made(f"velocity_{name}")
