@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import pathlib
+import sys
 from typing import Any
 
 from ..config.settings import load_config
@@ -66,6 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
     if arguments.verbose:
         logging.getLogger("envs").setLevel(logging.INFO)
+    if sys.stdout.isatty():
+        say("loading JAX and the task ...")  # ten seconds with Warp
     from ..policies import warm_start
     from ..training import processes, trainer
 

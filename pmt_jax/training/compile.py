@@ -140,16 +140,26 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     # The state is not donated: a seed that breaks returns to it.
     program = jax.jit(_over_seeds(setup, chunk, axes), out_shardings=(placement, everywhere))
     with sharding.use_mesh(setup.mesh), cache_events() as events:
-        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state).compile()
+        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state).compile(_options())
     programs = Programs(functools.partial(compiled, hyper), jax.jit(take, donate_argnums=1))
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
         with sharding.use_mesh(setup.mesh):
-            evaluation = program.lower(state).compile()
+            evaluation = program.lower(state).compile(_options())
         programs = programs._replace(evaluate=evaluation, measures=tuple(evaluation.out_info))
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     return state, programs, found
+
+
+def _options() -> dict[str, int] | None:
+    """XLA's options for a run's programs.
+
+    On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
+    training was no faster for it (docs/results/speed.md). Whoever sets a level in XLA_FLAGS gets that.
+    """
+    chosen = "xla_gpu_autotune_level" in os.environ.get("XLA_FLAGS", "")
+    return None if chosen or jax.default_backend() != "gpu" else {"xla_gpu_autotune_level": 0}
 
 
 def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pathlib
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import pytest
 
 from pmt_jax.training import compile, trainer
+from runs import ARGUMENTS, STEPS
 
 
 @pytest.mark.parametrize(
@@ -36,7 +38,7 @@ def test_a_device_without_room_gets_a_sentence(message: str, cli, monkeypatch, t
         raise jax.errors.JaxRuntimeError(message)
 
     monkeypatch.setattr(trainer.Trainer, "train", full)
-    arguments = ("train", "lane", "--steps", "1e4", "--out", tmp_path / "x")
+    arguments = ("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "x")
     if message.startswith("INTERNAL"):
         with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
             cli(*arguments)
@@ -44,6 +46,21 @@ def test_a_device_without_room_gets_a_sentence(message: str, cli, monkeypatch, t
     code, _, err = cli(*arguments)
     assert code == 2 and err.count("\n") == 1
     assert err.startswith("pmt: Out of memory while trying to allocate 5.71GiB; other programs may share the device")
+
+
+@pytest.mark.parametrize(
+    ("backend", "flags", "options"),
+    [
+        ("cpu", "", None),
+        ("gpu", "", {"xla_gpu_autotune_level": 0}),
+        ("gpu", "--xla_gpu_autotune_level=4", None),
+    ],
+)
+def test_xla_tries_out_no_kernels_on_a_gpu(backend: str, flags: str, options: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    assert compile._options() == options
+    assert jax.jit(lambda x: x + 1).lower(1).compile(options)(1) == 2  # the name is one that XLA knows
 
 
 @pytest.mark.parametrize("chosen", ["", "relative", None])
