@@ -132,6 +132,7 @@ def test_the_letter_of_the_paper_does_not_fear_what_is_rare():
     assert fear[3] > 0.95
 
 
+@pytest.mark.full
 def test_remembering_oneself_leaves_fear_unbiased_and_remembering_nothing_does_not():
     np.testing.assert_allclose(tabular("ce", l2=1.0), tabular("ce"), atol=0.02)
     shrunk = tabular("ce", l2=1.0, steps=2000, remembered="zero")
@@ -151,6 +152,7 @@ def test_without_weight_there_is_no_loss_and_no_gradient():
     np.testing.assert_array_equal(jax.grad(objective)(logits), 0)
 
 
+@pytest.mark.full
 def test_regret_learns_how_deliberate_a_costly_action_was():
     import flax.linen as nn
 

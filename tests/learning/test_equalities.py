@@ -22,6 +22,7 @@ def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
     chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
 
 
+@pytest.mark.full
 def test_a_multiplier_that_acts_makes_a_difference():
     with pytest.raises(AssertionError):
         chex.assert_trees_all_equal(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])

@@ -60,6 +60,7 @@ def random(x: jax.Array) -> jax.Array:
     return jnp.asarray(np.random.default_rng(x.size).normal(size=x.shape), x.dtype)
 
 
+@pytest.mark.full
 def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
     source, learned = first("ant_2x4")
     assert learned.fear

@@ -242,6 +242,7 @@ def test_still_half_flexed_hands_keep_the_egg_until_time_cuts_the_episode(holdin
     np.testing.assert_allclose(outcome.reward.sum(axis=0).mean(), 3.4, atol=0.3)  # what learning has to beat
 
 
+@pytest.mark.full
 def test_contacts_at_rest_are_no_deeper_than_3_mm(holding):
     qpos, _ = holding
     model, depths = made().model, []
@@ -348,6 +349,7 @@ def test_a_thousand_random_steps_break_nothing(physics):
     assert not broken.any()
 
 
+@pytest.mark.full
 def test_the_egg_can_be_handed_over():
     """Actions found by search (docs/figures/hand_over.py), from the three starts that they were found on."""
     env, found = made(), json.loads(CATCH.read_text())
