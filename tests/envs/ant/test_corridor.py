@@ -350,7 +350,7 @@ def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
     assert (furthest[0] < off).all() and (off < furthest[1]).all()
 
 
-@pytest.mark.full
+@pytest.mark.slow  # MJX compiles it for a minute
 def test_mjx_feels_solid_walls_as_c_does():
     env, step = walled("solid", "mjx")
     states = flight("solid")[:16]

@@ -22,7 +22,6 @@ PLACES = ("torso_xpos", "com")  # what `restore` takes beside qpos, of the robot
 TOLERANCES = {"mujoco": (2e-5, 5e-4, 5e-4, 1e-3, 0.002), "mjx": (5e-5, 5e-3, 1e-3, 2e-3, 0.01)}
 TOLERANCES["warp"] = TOLERANCES["mujoco"]
 EDGE = 1e-4  # m/s to the threshold, within which float32 may decide either way
-MJX = {"velocity_hopper_3x1", "velocity_swimmer_2x1"}
 PARTITIONED = {"velocity_ant_4x2", "velocity_half_cheetah_6x1"}  # the robots of other tasks, shared out otherwise
 
 
@@ -80,10 +79,11 @@ def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
 
 
-# MJX compiles a robot for a minute: one with contacts and one in a fluid in .ci/run, the others by hand.
-# tests/envs/ant/test_corridor.py has an ant on MJX.
+# MJX compiles a robot for up to a minute: the one in a fluid in .ci/run, the others by hand. Contacts on MJX are those
+# of the ant in tests/envs/ant/test_corridor.py.
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.full if x in MJX else pytest.mark.slow) for x in NAMES]
+    "name",
+    [pytest.param(x, marks=pytest.mark.full if x == "velocity_swimmer_2x1" else pytest.mark.slow) for x in NAMES],
 )
 def test_reproduces_the_recorded_steps_on_mjx(name):
     check_replay(name, "mjx")
