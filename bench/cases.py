@@ -24,7 +24,7 @@ class Case:
         the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned; the kernels of an
         integration step.
       task: an environment, or a network for power flows.
-      what: which start, tool, policy or walls.
+      what: which start, tool, policy, walls or rule.
       method, physics, solver: of training and of the engine; the task's own if left out.
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
@@ -110,6 +110,15 @@ def _training(task: str, method: str, seeds: int, num_envs: int, length: int, *m
 
 def _plain(task: str) -> tuple[Case, ...]:
     return Case("plain loop", task, threads=1), Case("plain loop", task)
+
+
+def _ruled(task: str, *settings: tuple[str, Any]) -> tuple[Case, ...]:
+    pid = (("lambda_kp", 0.5), ("lambda_kd", 0.1))
+    rules = {"integral": (), "pid": pid}
+    return tuple(
+        _training(task, "mappo_l", 1, 64, 64, *settings, ("lambda_rule", rule), *gains, what=rule)
+        for rule, gains in rules.items()
+    )
 
 
 def _in_jobs(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
@@ -200,6 +209,11 @@ BENCHES = {
             *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
+    ),
+    "multiplier": Bench(
+        "the multiplier's rule: steps/s of the whole training loop with the integral and with PID",
+        (*_ruled("ant_2x4", *_BATCH), *_ruled("switch", *_LIKE_THE_ANT)),
+        _ruled("switch", *_LIKE_THE_ANT),
     ),
     "grid": Bench(
         "power flows/s beside other tools; environment steps/s in a scan and with a call a step",

@@ -86,6 +86,10 @@ def _of_reference_walls(row: Row, rows: Rows) -> float | None:
     return _over(row, rows, **same, what="reference")
 
 
+def _of_integral(row: Row, rows: Rows) -> float | None:
+    return _over(row, rows, task=row["task"], what="integral")
+
+
 def _efficiency(row: Row, rows: Rows) -> float | None:
     ratio = _over(row, rows, task=row["task"], what="one device")
     return ratio and ratio / row.get("devices", 1)
@@ -198,6 +202,8 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "of plain loop x threads": _shown("{:.2f}", _of_plain),
     "walls": _shown("{}", "what"),
     "of reference": _shown("{:.2f}", _of_reference_walls),
+    "rule": _shown("{}", "what"),
+    "of integral": _shown("{:.3f}", _of_integral),
     "the same per CPU-second": _shown("{:.2f}", _of_plain_per_cpu),
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
@@ -371,6 +377,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         ("training",),
         ("task", "method", "compile, s", "compile x MAPPO-L", "update, s", "update x MAPPO-L", "environment steps/s"),
     ),
+    "multiplier": Table("multiplier", ("training",), ("task", "rule", "environment steps/s", "of integral")),
     "power_flows": Table(
         "grid", ("power flow",), ("task", "batch", "what", "power flows/s", "ours f32 is faster by (lowest)")
     ),
