@@ -152,14 +152,14 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     return state, programs, found
 
 
-def _options() -> dict[str, int] | None:
+def _options() -> dict[str, str | bool] | None:
     """XLA's options for a run's programs.
 
     On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
     training was no faster for it (docs/results/speed.md). Whoever sets a level in XLA_FLAGS gets that.
     """
     chosen = "xla_gpu_autotune_level" in os.environ.get("XLA_FLAGS", "")
-    return None if chosen or jax.default_backend() != "gpu" else {"xla_gpu_autotune_level": 0}
+    return None if chosen or jax.default_backend() != "gpu" else {"xla_gpu_autotune_level": "0"}
 
 
 def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:

@@ -52,7 +52,7 @@ def test_a_device_without_room_gets_a_sentence(message: str, cli, monkeypatch, t
     ("backend", "flags", "options"),
     [
         ("cpu", "", None),
-        ("gpu", "", {"xla_gpu_autotune_level": 0}),
+        ("gpu", "", {"xla_gpu_autotune_level": "0"}),
         ("gpu", "--xla_gpu_autotune_level=4", None),
     ],
 )
