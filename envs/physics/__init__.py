@@ -4,7 +4,7 @@
 |----------|---------------|---------------------------------------------------------------------|
 | `mujoco` | CPU           | MuJoCo's C engine on threads, called by XLA once per step           |
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
-| `warp`   | NVIDIA GPU    | MuJoCo-Warp, a control step of all environments as one CUDA graph   |
+| `warp`   | NVIDIA GPU    | MuJoCo-Warp, a control step as one CUDA graph, with that frame too  |
 
 Signatures are those of one environment; batches come from `jax.vmap`, nested to any depth.
 

@@ -35,9 +35,13 @@ def check_hooks() -> None:
     table = getattr(collision_driver, "_COLLISION_FUNC", {})
     found = set(_contacts()) <= set(table) and callable(getattr(solver, "_while_loop_scan", None))
     if not found:
-        raise TaskError(
-            f"mujoco-mjx {installed_version('mujoco-mjx')} lacks the private hooks of {MUJOCO_SERIES}; {INSTALL}"
-        )
+        raise no_hooks()
+
+
+def no_hooks() -> TaskError:
+    """What to raise where MJX, or the Warp in it, has no place for what is replaced."""
+    found = installed_version("mujoco-mjx")
+    return TaskError(f"mujoco-mjx {found} lacks the private hooks of {MUJOCO_SERIES}; {INSTALL}")
 
 
 _HOOKING = threading.RLock()  # the hooks are module globals; two threads may trace at once

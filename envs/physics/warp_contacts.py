@@ -5,15 +5,9 @@
 from __future__ import annotations
 
 import warp
+from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive, collision_primitive_core
 
-from ..errors import TaskError
-from ..versions import installed_version
-from .contract import INSTALL, MUJOCO_SERIES
-from .mjx_patches import import_mjx
-
-import_mjx()  # it brings MuJoCo-Warp
-
-from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive, collision_primitive_core  # noqa: E402
+from .mjx_patches import no_hooks
 
 
 def install() -> None:
@@ -23,9 +17,7 @@ def install() -> None:
       TaskError: this MuJoCo-Warp has no such place.
     """
     if not hasattr(collision_primitive, "plane_capsule"):
-        raise TaskError(
-            f"mujoco-mjx {installed_version('mujoco-mjx')} lacks the private hooks of {MUJOCO_SERIES}; {INSTALL}"
-        )
+        raise no_hooks()
     collision_primitive.plane_capsule = _plane_capsule
 
 

@@ -201,7 +201,7 @@ jax.block_until_ready(roll(state, 2))
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("task", ["ant_2x4", pytest.param("hand_over_2x6", marks=pytest.mark.full)])
+@pytest.mark.parametrize("task", ["ant_2x4", "hand_over_2x6"])
 def test_leaves_cleanly_while_a_program_runs(task):
     done = run(ROLL.replace("ant_2x4", task) + "later = roll(state, 100000)\nprint('leaving')\n")
     assert done.returncode == 0 and "leaving" in done.stdout, done.stderr
