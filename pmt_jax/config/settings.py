@@ -201,15 +201,22 @@ class Config(Hyper):
         "an episode cut by its time limit bootstraps from the state it was cut in, or ends there as if by the task's "
         "own rule (SafePO)",
     )
-    cost_estimate: Literal["episode", "rate", "critic"] = constraint(
+    episode_starts: Literal["together", "spread"] = learning(
+        "together",
+        "environments begin their first episodes at once, or spread over the time limit, so that a batch has all parts "
+        "of an episode even where only the time limit ends one",
+    )
+    cost_estimate: Literal["episode", "rate", "average", "critic"] = constraint(
         "episode",
         "estimate of the episode cost for the multiplier: mean of the episodes that finished in this update, the cost "
-        "rate of this update's steps times the horizon, or the same of the cost critic's values",
+        "rate of this update's steps times the horizon, that rate's moving average over an episode's time, or the rate "
+        "of the cost critic's values",
     )
-    lambda_unit: Literal["step", "limit"] = constraint(
+    lambda_unit: Literal["step", "limit", "relative"] = constraint(
         "step",
         "unit of the excess that changes the multiplier: cost per step, or share of the limit, cut at 1, so that one "
-        "lambda_lr fits all limits and horizons",
+        "lambda_lr fits all limits and horizons; relative: that share, and the multiplier changes in proportion to "
+        "itself, so that it becomes large soon where a tight limit needs it",
     )
     lambda_rule: Literal["integral", "pid"] = constraint(
         "integral",
@@ -393,6 +400,8 @@ def _validate(config: Config) -> None:
         raise UsageError(f"seed must lie between 0 and 2**31 - seeds, not {config.seed}")
     if config.lambda_init > config.lambda_max:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
+    if config.lambda_unit == "relative" and not config.lambda_init:
+        raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
     _validate_sizes(config)
 
 

@@ -86,7 +86,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         episode_cost=jnp.full(heads, jnp.asarray(hyper.cost_limit)),
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
-        rollout=rollout.start(setup.vector, tagged[Tag.ENV]),
+        rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
         key=tagged[Tag.UPDATE],
         update=jnp.zeros((), jnp.int32),
     )

@@ -166,7 +166,8 @@ def _update_multiplier(
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
     excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)
-    return lagrangian.dual_update(multiplier, excess, hyper.lambda_lr, hyper.lambda_max)
+    step = lagrangian.relative_update if setup.config.lambda_unit == "relative" else lagrangian.dual_update
+    return step(multiplier, excess, hyper.lambda_lr, hyper.lambda_max)
 
 
 def in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:

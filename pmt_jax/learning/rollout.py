@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -17,13 +18,22 @@ Normalise = Callable[[jax.Array], jax.Array]
 Feel = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K] of a step, its number [] -> felt cost
 
 
-def start(vector: VectorEnv, key: jax.Array) -> RolloutState:
-    """Fresh episodes everywhere, nothing summed yet."""
+def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutState:
+    """Fresh episodes everywhere, nothing summed yet.
+
+    Args:
+      spread: the time limit counts as if environment b of B had spent b / B of an episode, so that it ends episodes
+        evenly over time. The first episodes are cut short by that.
+    """
     spec = vector.spec
+    first = vector.reset(key)
+    if spread:
+        elapsed = jnp.arange(vector.num_envs) * vector.horizon // vector.num_envs
+        first = dataclasses.replace(first, elapsed=elapsed.astype(first.elapsed.dtype))
     zero = jnp.zeros(vector.num_envs)
     zeros = jnp.zeros((vector.num_envs, spec.num_agents, spec.num_costs))
     return RolloutState(
-        vector=vector.reset(key),
+        vector=first,
         reward_sum=zero,
         cost_sum=zeros,
         true_cost_sum=zeros,
@@ -128,10 +138,15 @@ def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: 
     """The undiscounted cost per episode [N, K] that the multiplier is updated with.
 
     `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
-    times the horizon; no lag, for batches much shorter than an episode.
+    times the horizon; no lag, for batches much shorter than an episode. `average`: the rate's moving average, in which
+    a batch has the weight of its share of an episode's time. It is for an excess that is cut (`lagrangian.in_limits`):
+    where few batches have costs, cut rates are lower on average than the rate is.
     """
+    rate = horizon * batch.cost.mean((0, 1))
     if how == "rate":
-        return horizon * batch.cost.mean((0, 1))
+        return rate
+    if how == "average":
+        return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
     finished = finished_mean(batch, batch.episode_cost)
     return jnp.where(batch.done.any(), finished, previous)
 

@@ -91,6 +91,7 @@ train lane --cost-limit 1e39 | cost_limit must be a cost per episode of at least
 train lane --cost-limit one | cost_limit = 'one' does not fit: expected a number, or one for each cost
 train lane --cost-false -0.1 | cost_false must lie in [0, 1), not -0.1
 train lane --lambda-max 0.1 | lambda_init = 0.78 lies above lambda_max = 0.1
+train lane --lambda-unit relative --lambda-init 0 | with lambda_unit = relative a multiplier of 0 never moves
 train lane --physics= | physics = '' does not fit: expected auto | mjx
 train lane --env num_agents | env = ['num_agents'] does not fit: expected name=value
 train lane --env =3 | task 'lane' has no option ''

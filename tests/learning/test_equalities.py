@@ -80,6 +80,17 @@ def test_a_multiplier_in_units_of_the_limit_climbs_alike_below_every_limit():
 
 
 @pytest.mark.full
+def test_a_relative_multiplier_grows_by_the_same_share_below_every_limit():
+    made = program("mappo_l", lambda_unit="relative")
+    for limit in 1.0, 0.125:
+        after, _ = made.step(
+            made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
+            made.init(made.setup.hyper, jax.random.key(0)),
+        )
+        np.testing.assert_allclose(after.multiplier, 0.78 * np.exp(0.25), rtol=1e-6)
+
+
+@pytest.mark.full
 def test_happo_and_mappo_are_the_same_with_one_agent():
     happo, mappo = (trained(method, env=(("num_agents", 1),))[0] for method in ("happo", "mappo"))
     chex.assert_trees_all_equal(weights(happo), weights(mappo))

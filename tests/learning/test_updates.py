@@ -16,6 +16,7 @@ from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.config.settings import Hyper
 from pmt_jax.learning import learner, rollout
+from pmt_jax.learning.maths import lagrangian
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import LearnerState
 from small import SMALL, acted, program, trained, weights
@@ -211,9 +212,31 @@ def test_the_episode_estimate_keeps_its_value_until_an_episode_ends():
     np.testing.assert_array_equal(rollout.episode_cost_estimate(going, previous, "episode", 25), previous)
     rate = rollout.episode_cost_estimate(going, previous, "rate", 25)
     np.testing.assert_allclose(rate, 25 * batch.cost.mean((0, 1)), rtol=1e-6)
+    average = rollout.episode_cost_estimate(going, previous, "average", 100)  # 25 of 100 steps: a quarter of the way
+    np.testing.assert_allclose(average, previous + (4 * rate - previous) / 4, rtol=1e-6)
+    whole = rollout.episode_cost_estimate(going, previous, "average", 10)
+    np.testing.assert_allclose(whole, 10 * batch.cost.mean((0, 1)), rtol=1e-6)
     ended = dataclasses.replace(going, truncated=going.truncated.at[3, 2].set(True))
     estimate = rollout.episode_cost_estimate(ended, previous, "episode", 25)
     np.testing.assert_array_equal(estimate, batch.episode_cost[3, 2])
+
+
+def test_a_cut_excess_of_the_average_sees_rare_costs_that_cut_rates_miss():
+    """One batch in five has a cost of five limits: twice what the margin allows. Cut rates say it is within."""
+    quiet, costly = jnp.zeros((1, 1, 1, 1)), jnp.full((1, 1, 1, 1), 0.05)  # at a limit of 1 in 100 steps
+    _, _, batch = acted()
+
+    def drift(how: str) -> float:
+        estimate, total = jnp.ones((1, 1)), 0.0
+        for t in range(500):
+            seen = dataclasses.replace(batch, cost=costly if t % 5 == 0 else quiet)
+            estimate = rollout.episode_cost_estimate(seen, estimate, how, 100)
+            excess = lagrangian.cost_excess(estimate, lagrangian.held_limit(1.0, 0.5), 100)
+            total += lagrangian.in_limits(excess, 1.0, 100).item()
+        return total / 500
+
+    np.testing.assert_allclose(drift("rate"), (1 - 4 * 0.5) / 5, rtol=1e-5)
+    np.testing.assert_allclose(drift("average"), 1.0 - 0.5, rtol=0.1)
 
 
 def test_share_of_episodes_within_and_cost_beyond_the_limit():
@@ -248,6 +271,20 @@ def test_figures_of_episodes_count_finished_ones_only():
     np.testing.assert_array_equal(metrics["episodes"], [0, 0, 8, 0, 8])
     np.testing.assert_array_equal(np.isfinite(metrics["episode_reward"]), [False, False, True, False, True])
     np.testing.assert_array_equal(metrics["episode_length"][np.array([2, 4])], 25)
+
+
+def test_spread_starts_end_as_many_episodes_in_every_rollout():
+    """Ten environments and rollouts of 5 steps: an episode of 25 steps is five rollouts long."""
+    setup = make_setup(load_config("lane", num_envs=10, rollout_length=5, episode_starts="spread"))
+    state = learner.init(setup, setup.hyper, jax.random.key(0))
+    ended, lengths = [], []
+    step = jax.jit(lambda state: learner.train_step(setup, setup.hyper, state))
+    for _ in range(10):
+        state, metrics = step(state)
+        ended.append(int(metrics["episodes"]))
+        lengths.append(float(metrics["episode_length"]))
+    assert ended == [2] * 10
+    assert lengths[:4] == [4.0, 9.0, 14.0, 19.0] and lengths[5:] == [25.0] * 5
 
 
 def hyper_of(setup: Setup, limits: float | list[float], **changes: float) -> Hyper:

@@ -54,6 +54,23 @@ def dual_update(
     return jnp.clip(multiplier + lambda_lr * excess, 0.0, lambda_max)
 
 
+def relative_update(
+    multiplier: jax.Array,
+    excess: jax.Array,
+    lambda_lr: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """One step in proportion to the multiplier: lambda <- min(lambda exp(alpha x), lambda_max).
+
+    An exponentiated gradient (Kivinen and Warmuth, 1997). A multiplier doubles in the same time whatever its size, so
+    one rate serves limits whose multipliers differ by a factor of ten.
+
+    Args:
+      multiplier: [...], lambda > 0; excess: [...], x, `in_limits`.
+    """
+    return jnp.minimum(multiplier * jnp.exp(lambda_lr * excess), lambda_max)
+
+
 def lowered_limit(
     lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, reach: jax.Array
 ) -> jax.Array:
