@@ -28,7 +28,7 @@ class Case:
       method, physics, solver: of training and of the engine; the task's own if left out.
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
-      devices: that share the environments and seeds; threads: of a plain loop, 0 for all that there are.
+      devices: that share the environments and seeds; threads: plain loops at once, 0 for one on each of all CPUs.
       jobs: worker processes that share the seeds of a training and the CPUs; cases with more jobs than CPUs do not run.
       settings: other settings of the training; alone, other options of the environment.
     """

@@ -1,16 +1,20 @@
-"""What one would write without this library: a Python loop over C MuJoCo, random actions, no observations.
+"""What one would write without this library: Python loops over C MuJoCo, random actions, no observations.
 
-It takes a task's model as it is; our C engine skips MuJoCo's search for islands in it, which changes no bit and is
-worth 6 % on the ant.
+Loops that run at once have a process each: threads of one process wait for Python's lock, and 16 of them kept 9 CPUs
+busy. A loop takes a task's model as it is; our C engine skips MuJoCo's search for islands in it, which changes no bit
+and is worth 6 % on the ant.
 """
 
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import contextlib
 import functools
+import multiprocessing
+import signal
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 import mujoco
@@ -86,25 +90,54 @@ TASKS: dict[str, Callable[[], Task]] = {
 
 
 def plain_loop(case: Case) -> Build:
-    """As many loops at once as the case has threads; MuJoCo releases the interpreter lock while it steps."""
+    """As many loops at once as the case has threads: one in this process, and one in each of its workers."""
     task, threads = TASKS[case.task](), case.threads or usable_cpus()
 
-    def loop(seed: int) -> None:
-        model, data, rng = task.model, mujoco.MjData(task.model), np.random.default_rng(seed)
-        low, high = model.actuator_ctrlrange.T
-        task.reset(data, rng)
-        for action in rng.uniform(low, high, (STEPS, model.nu)):
-            data.ctrl[:] = action
-            mujoco.mj_step(model, data, task.substeps)
-            if task.over(model, data):
-                mujoco.mj_resetData(model, data)
-                task.reset(data, rng)
+    def build() -> Program:
+        workers = [_worker(case.task, seed) for seed in range(1, threads)]
 
-    def call() -> None:
-        if threads == 1:
-            loop(0)
-        else:
-            list(pool.map(loop, range(threads)))
+        def call() -> None:
+            for worker in workers:
+                worker.send(None)
+            _loop(task, 0)
+            for worker in workers:
+                worker.recv()
 
-    pool = ThreadPoolExecutor(threads)
-    return lambda: Program(call, threads * STEPS, {"threads": threads})
+        for worker in workers:
+            worker.recv()
+        return Program(call, threads * STEPS, {"threads": threads})
+
+    return build
+
+
+def _loop(task: Task, seed: int) -> None:
+    """STEPS control steps."""
+    model, data, rng = task.model, mujoco.MjData(task.model), np.random.default_rng(seed)
+    low, high = model.actuator_ctrlrange.T
+    task.reset(data, rng)
+    for action in rng.uniform(low, high, (STEPS, model.nu)):
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data, task.substeps)
+        if task.over(model, data):
+            mujoco.mj_resetData(model, data)
+            task.reset(data, rng)
+
+
+def _worker(task: str, seed: int) -> Connection:
+    """Starts a process that runs the loop whenever it is sent None; it answers None, also once it is ready."""
+    context = multiprocessing.get_context("spawn")  # a fork would copy the locks of JAX's threads
+    ours, theirs = context.Pipe()
+    context.Process(target=_serve, args=(theirs, task, seed), daemon=True).start()
+    theirs.close()  # the worker's end alone is left: where either process dies, the other one's reading ends
+    return ours
+
+
+def _serve(pipe: Connection, name: str, seed: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C ends the bench, and that its workers
+    task = TASKS[name]()
+    _loop(task, seed)
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            pipe.send(None)
+            pipe.recv()
+            _loop(task, seed)

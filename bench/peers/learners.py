@@ -79,7 +79,7 @@ def ours(arguments: Arguments, report: Report) -> None:
 
 
 def plain(arguments: Arguments, report: Report) -> None:
-    """Python loops over C MuJoCo, one a thread, with random actions."""
+    """Python loops over C MuJoCo, one on each CPU, with random actions."""
     del arguments
     program = plain_loop(Case("plain loop", TASK))()
     report.about(physics="mujoco", threads=program.facts["threads"])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pathlib
 import re
 import sys
+import time
 import tomllib
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -17,7 +19,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, records, render, runner, substep
+from bench import compare, measure, once, plain, records, render, runner, substep
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.forms import pages, runs, tables
@@ -145,6 +147,19 @@ def test_workers_share_seeds_and_cpus():
         program.call()
 
 
+def test_plain_loops_have_processes_that_end_with_their_program():
+    before = multiprocessing.active_children()
+    program = plain.plain_loop(Case("plain loop", "ant_2x4", threads=2))()
+    assert program.steps == 2 * plain.STEPS
+    (worker,) = set(multiprocessing.active_children()) - set(before)
+    watch, begin = measure.Watch(), time.process_time()
+    program.call()
+    assert watch.own > 1.3 * (time.process_time() - begin)  # the worker's time counts
+    del program
+    worker.join(10)
+    assert worker.exitcode == 0
+
+
 def test_quick_and_only_choose_cases(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
     seen = []
     monkeypatch.setattr(measure, "rows", lambda bench, cases, effort, say: seen.append((cases, effort)) or [])
@@ -201,13 +216,16 @@ def test_ratios_between_rows_are_taken_turn_by_turn():
     def row(kind: str, rates: list[float], **more: Any) -> records.Row:
         return {"kind": kind, "task": "x", "steps_per_second": float(np.median(rates)), "rates": rates, **more}
 
-    plain = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]
+    loops = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]
     alone = row("environment", [160, 90, 170], num_envs=8, physics="mujoco")  # the machine was busy in the second turn
-    shown = tables.COLUMNS["of plain loop x threads"](alone, [*plain, alone])
+    shown = tables.COLUMNS["of plain loop x threads"](alone, [*loops, alone])
     assert shown == "0.85"  # the median of 0.8, 0.9 and 0.85
     one, five = ({"kind": "training", "task": "x", "seeds": n, "steps_per_second": 100.0 * n / 2} for n in (1, 5))
     assert tables.COLUMNS["x one seed"](five, [one, five]) == "1.00"
     assert tables.COLUMNS["x one seed"](one, [one, five]) == "-"
+    locked = loops[1] | {"steps_per_cpu_second": 125}  # that waited for each other
+    assert tables.COLUMNS["of a plain loop on each core"](five, [locked, five]) == "1.00"
+    assert tables.COLUMNS["of a plain loop on each core"](five, [five]) == "-"
 
 
 def test_a_table_for_each_device_and_a_failure_in_it():
