@@ -75,6 +75,12 @@ def _of_plain_per_cpu(row: Row, rows: Rows) -> float | None:
     return row["steps_per_cpu_second"] / plain[0]["steps_per_cpu_second"] if known else None
 
 
+def _of_plain_on_each_core(row: Row, rows: Rows) -> float | None:
+    """The rate over the steps that a plain loop makes in a CPU-second, on every core."""
+    plain = max(matching(rows, kind="plain loop"), key=lambda loops: loops["threads"], default={})
+    return rate(row) / (plain["threads"] * plain["steps_per_cpu_second"]) if plain and rate(row) else None
+
+
 def _times_one_seed(row: Row, rows: Rows) -> float | None:
     same = {name: row.get(name) for name in ("kind", "task", "method", "physics", "num_envs", "rollout_length")}
     ratio = _over(row, rows, **same, seeds=1) if row.get("seeds", 1) > 1 else None
@@ -204,6 +210,9 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "of reference": _shown("{:.2f}", _of_reference_walls),
     "rule": _shown("{}", "what"),
     "of integral": _shown("{:.3f}", _of_integral),
+    "worker processes": _shown("{}", "jobs"),
+    "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
+    "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
     "the same per CPU-second": _shown("{:.2f}", _of_plain_per_cpu),
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
@@ -371,6 +380,11 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
     ),
     "hands": Table("hands", EVERY, (*SPEED, *CPU_SECONDS)),
+    "workstation": Table(
+        "workstation",
+        EVERY,
+        ("", SIZES, "worker processes", "environment steps/s", "steps per CPU-second", "of a plain loop on each core"),
+    ),
     "velocity": Table("velocity", EVERY, ("task", *SPEED, CPU_SECONDS[0])),
     "methods": Table(
         "methods",
