@@ -146,7 +146,10 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
     config, device = setup.config, jax.devices()[0]
     steps = config.num_updates * config.batch_size
     threads = f", {len(os.sched_getaffinity(0))} CPUs" if hasattr(os, "sched_getaffinity") else ""
-    say(f"pmt: {config.method} on {config.task}, {config.seeds} seed(s) from {config.seed}, into {out}")
+    seeds = f"{config.seeds} seed(s) from {config.seed}"
+    if setup.trials:
+        seeds = f"{config.seeds} runs, seeds {setup.trials.seed.min()} to {setup.trials.seed.max()}"
+    say(f"pmt: {config.method} on {config.task}, {seeds}, into {out}")
     say(f"device {device.device_kind} ({device.platform}{threads}), physics engine {setup.vector.env.engine}")
     if setup.mesh:
         seeds, environments = setup.mesh.devices.shape
