@@ -13,7 +13,7 @@ from . import sharding
 from .maths import distributions, lagrangian, trust_region
 from .maths.advantages import standardise
 from .maths.losses import clipped_surrogate, hybrid_advantage
-from .optimise import fit
+from .optimise import fit, shuffled
 from .setup import Setup
 from .types import Batch, Hyper, LearnerState, Metrics, Params, PolicyRows, Tag, TrainState
 
@@ -230,7 +230,7 @@ def _trust_region_steps(
     rows = dataclasses.replace(rows, cost_advantage=rows.cost_advantage[:, worst])
     steps = setup.config.trust_steps
     if steps > 1:
-        shuffle = jax.random.permutation(key, rows.log_prob.shape[0])
+        shuffle = shuffled(key, rows.log_prob.shape[0])
         rows = jax.tree.map(lambda x: x[shuffle], rows)
     parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), rows)
 

@@ -15,7 +15,7 @@ from pmt_jax.learning.maths import distributions, lagrangian, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
 from pmt_jax.learning.maths.losses import clipped_surrogate, huber, hybrid_advantage, value_loss
 from pmt_jax.learning.networks import LayerNorm
-from pmt_jax.learning.optimise import fit, init_train_state
+from pmt_jax.learning.optimise import fit, init_train_state, shuffled
 
 
 def column(x: list[float], dtype: type = float) -> jax.Array:
@@ -280,3 +280,17 @@ def test_layer_normalisation_is_what_its_name_says():
     x = 3 * jax.random.normal(jax.random.key(0), (7, 33)) + 2
     weights = {"params": {"scale": jnp.arange(33.0) / 10, "bias": jnp.arange(33.0)}}
     np.testing.assert_allclose(LayerNorm().apply(weights, x), nn.LayerNorm().apply(weights, x), atol=2e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 4096, 5000])
+def test_shuffled_is_every_row_once(count: int):
+    first, second = (shuffled(jax.random.key(seed), count) for seed in (0, 1))
+    np.testing.assert_array_equal(jnp.sort(first), np.arange(count))
+    assert count < 3 or (first != second).any()
+
+
+def test_shuffled_brings_every_row_to_every_place_alike():
+    """4,000 shuffles of 8 rows: each row is in each place 500 times, give or take five standard deviations."""
+    orders = jax.vmap(lambda key: shuffled(key, 8))(jax.random.split(jax.random.key(0), 4000))
+    counts = (orders[:, :, None] == jnp.arange(8)).sum(0)
+    assert np.abs(counts - 500).max() < 5 * np.sqrt(500 * 7 / 8)
