@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.interpreters import xla
 
 from envs import adapters
 from envs.base import Env
@@ -157,6 +158,8 @@ def _jaxmarl(arguments: Arguments, report: Report, env: Callable[..., Any] | Non
 
     sys.modules["wandb"] = types.ModuleType("wandb")
     sys.modules["wandb"].log = log  # pyright: ignore[reportAttributeAccessIssue]  # all that training does with it
+    if not hasattr(xla, "pytype_aval_mappings"):  # gone in jax 0.11; the trainer's TensorFlow Probability reads it
+        xla.pytype_aval_mappings = jax.core.pytype_aval_mappings  # pyright: ignore[reportAttributeAccessIssue]
     spec = importlib.util.spec_from_file_location("ippo", file)
     assert spec and spec.loader
     trainer: Any = importlib.util.module_from_spec(spec)
