@@ -98,6 +98,7 @@ STATED: dict[str, dict[str, str]] = {
         "thresholds": "0.04891 0.9613 1.641 2.418 2.522 2.932 3.227",
         "bounds of actions and heights": "0.2 0.4",
         "settings and seeds": "0.78 512 90 94",
+        "ratios of rows of velocity.json": "1.22 1.06 1.28 1.11 0.95 0.92",
         "steps and rates of the trial, and a run on a CPU": "10.2 306,000 412,000 38",
         "versions of MuJoCo": "2.3 3.17",
         "bounds of tests": "2e-5 1e-3 1e-4",
