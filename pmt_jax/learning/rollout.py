@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..tasks import Outcome, State, VectorEnv
 from . import sharding
@@ -23,13 +24,13 @@ def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutSta
 
     Args:
       spread: the time limit counts as if environment b of B had spent b / B of an episode, so that it ends episodes
-        evenly over time. The first episodes are cut short by that.
+        evenly over time. The first episodes are cut short by that, and no metric of episodes counts them.
     """
     spec = vector.spec
     first = vector.reset(key)
     if spread:
-        elapsed = jnp.arange(vector.num_envs) * vector.horizon // vector.num_envs
-        first = dataclasses.replace(first, elapsed=elapsed.astype(first.elapsed.dtype))
+        elapsed = np.arange(vector.num_envs) * vector.horizon // vector.num_envs
+        first = dataclasses.replace(first, elapsed=jnp.asarray(elapsed, first.elapsed.dtype))
     zero = jnp.zeros(vector.num_envs)
     zeros = jnp.zeros((vector.num_envs, spec.num_agents, spec.num_costs))
     return RolloutState(
@@ -87,6 +88,7 @@ def collect(
             "state": normalise_state(env.global_state),
             "next_state": normalise_state(outcome.next_global_state),
             "cost": felt,
+            "whole": state.vector.elapsed == state.length,
         }
         return _clear_finished(sums, outcome), (_record(seen, outcome, sums), (env.obs, env.global_state))
 
@@ -118,9 +120,9 @@ def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
 
 
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
-    """Mean of `x` [T, B, ...] over the steps that ended an episode; nan if none did."""
-    done = batch.done.reshape(batch.done.shape + (1,) * (x.ndim - 2))
-    return jnp.sum(x * done, (0, 1)) / done.sum()  # 0 / 0 is nan
+    """Mean of `x` [T, B, ...] over the steps that ended a whole episode; nan if none did."""
+    finished = batch.finished.reshape(batch.done.shape + (1,) * (x.ndim - 2))
+    return jnp.sum(x * finished, (0, 1)) / finished.sum()  # 0 / 0 is nan
 
 
 def within_limit(batch: Batch, hyper: Hyper) -> jax.Array:
@@ -148,7 +150,7 @@ def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: 
     if how == "average":
         return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
     finished = finished_mean(batch, batch.episode_cost)
-    return jnp.where(batch.done.any(), finished, previous)
+    return jnp.where(batch.finished.any(), finished, previous)
 
 
 def summary(batch: Batch) -> dict[str, jax.Array]:
@@ -164,7 +166,7 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "episode_reward": finished_mean(batch, batch.episode_reward),
         "episode_cost": finished_mean(batch, batch.episode_cost.sum(-1).mean(-1)),
         "episode_length": finished_mean(batch, batch.episode_length),
-        "episodes": batch.done.sum(),
+        "episodes": batch.finished.sum(),
         "terminations": batch.terminated.sum(),
         "violation_rate": (cost.max(-1) > 0).mean(),
         "step_reward": batch.reward.mean(),

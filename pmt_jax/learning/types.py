@@ -81,6 +81,7 @@ class Batch:
       non_finite: [T, B] bool, quarantined steps.
       episode_reward: [T, B], episode_cost and true_episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to
         and with this step; complete if the episode is done.
+      whole: [T, B] bool, the episode began with a reset; False in a first one that is cut (see `rollout.start`).
     """
 
     obs: jax.Array
@@ -101,11 +102,17 @@ class Batch:
     episode_cost: jax.Array
     true_episode_cost: jax.Array
     episode_length: jax.Array
+    whole: jax.Array
 
     @property
     def done(self) -> jax.Array:
         """[T, B] bool: the episode ended with this step, for whichever reason."""
         return self.terminated | self.truncated
+
+    @property
+    def finished(self) -> jax.Array:
+        """[T, B] bool: a whole episode ended with this step."""
+        return self.done & self.whole
 
 
 @pytree

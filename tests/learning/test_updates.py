@@ -273,18 +273,22 @@ def test_figures_of_episodes_count_finished_ones_only():
     np.testing.assert_array_equal(metrics["episode_length"][np.array([2, 4])], 25)
 
 
-def test_spread_starts_end_as_many_episodes_in_every_rollout():
+def test_spread_starts_end_as_many_episodes_in_every_rollout_and_count_whole_ones():
     """Ten environments and rollouts of 5 steps: an episode of 25 steps is five rollouts long."""
     setup = make_setup(load_config("lane", num_envs=10, rollout_length=5, episode_starts="spread"))
     state = learner.init(setup, setup.hyper, jax.random.key(0))
-    ended, lengths = [], []
     step = jax.jit(lambda state: learner.train_step(setup, setup.hyper, state))
+    begun, counted, lengths = [], [], []
     for _ in range(10):
+        before = state.rollout.vector.episode
         state, metrics = step(state)
-        ended.append(int(metrics["episodes"]))
+        begun.append(int((state.rollout.vector.episode - before).sum()))
+        counted.append(int(metrics["episodes"]))
         lengths.append(float(metrics["episode_length"]))
-    assert ended == [2] * 10
-    assert lengths[:4] == [4.0, 9.0, 14.0, 19.0] and lengths[5:] == [25.0] * 5
+    assert begun == [2] * 10
+    # The first of environment 0 is whole; it ends in the fifth rollout. All that are cut have ended by then.
+    assert counted == [0] * 4 + [1] + [2] * 5
+    assert np.isnan(lengths[:4]).all() and lengths[4:] == [25.0] * 6
 
 
 def hyper_of(setup: Setup, limits: float | list[float], **changes: float) -> Hyper:
