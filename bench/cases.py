@@ -177,11 +177,7 @@ BENCHES = {
             *_in_jobs("ant_2x4", 8, (1, 2, 4, 8)),
             *_in_jobs("ant_2x4", 16, (1, 4, 8, 16)),
         ),
-        (
-            *_plain("ant_2x4")[1:],
-            *_in_jobs("ant_2x4", 2, (1, 2)),
-            *(case for seeds in (8, 16) for case in _in_jobs("ant_2x4", seeds, (1, seeds))),
-        ),
+        (*_plain("ant_2x4")[1:], *_in_jobs("ant_2x4", 2, (1, 2))),
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
