@@ -81,7 +81,8 @@ class Batch:
       non_finite: [T, B] bool, quarantined steps.
       episode_reward: [T, B], episode_cost and true_episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to
         and with this step; complete if the episode is done.
-      whole: [T, B] bool, the episode began with a reset; False in a first one that is cut (see `rollout.start`).
+      whole: [T, B] bool, the time limit counts from the episode's own beginning; False in first ones with spread starts
+        (see `rollout.start`), which it cuts short.
     """
 
     obs: jax.Array
