@@ -1,0 +1,73 @@
+"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import jobs
+
+HERE = pathlib.Path(__file__).parent
+SMOKE = "--smoke" in sys.argv
+OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
+GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
+BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
+END = 400.0 if SMOKE else jobs.END
+ENVIRONMENT = {
+    "PYTHONUNBUFFERED": "1",
+    "CUDA_MPS_PIPE_DIRECTORY": "/tmp/mps",
+    "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+    "XDG_CACHE_HOME": "/tmp/cache",
+    "WARP_CACHE_PATH": "/tmp/warp",
+}
+
+
+def log(*words: object) -> None:
+    print(f"{time.time() - BEGIN:.0f} s", *words, flush=True)
+
+
+def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
+    """`command` is what follows `python -m`; a run of pmt gets its folder."""
+    if command[0] == "pmt_jax":
+        command = [*command, "--out", str(OUT / "runs" / name)]
+        if SMOKE:
+            tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
+            command += tiny.split()
+    (OUT / "logs").mkdir(parents=True, exist_ok=True)
+    log("GPU", gpu, "starts", name)
+    with open(OUT / "logs" / name.replace("/", "-"), "w") as file:
+        where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": str(gpu)}
+        program = [sys.executable, "-m", *command]
+        return subprocess.Popen(program, env=os.environ | where, stdout=file, stderr=subprocess.STDOUT)
+
+
+def main() -> None:
+    queue, running = list(jobs.JOBS), []
+    while time.time() - BEGIN < END and (queue or running):
+        for gpu, name, process in list(running):
+            if process.poll() is not None:
+                log(name, "ended with", process.returncode)
+                running.remove((gpu, name, process))
+        at = [sum(gpu == one for gpu, _, _ in running) for one in range(GPUS)]
+        if queue and min(at) < jobs.PROGRAMS:
+            name, *command = queue.pop(0)
+            running.append((at.index(min(at)), name, start(at.index(min(at)), name, command)))
+        else:
+            time.sleep(1)
+    for _, _, process in running:
+        process.send_signal(signal.SIGINT)
+    for _, name, process in running:
+        try:
+            log(name, "saved with", process.wait(40))
+        except subprocess.TimeoutExpired:
+            log(name, "did not end")
+            process.kill()
+    (OUT / "ended").touch()
+
+
+if __name__ == "__main__":
+    main()

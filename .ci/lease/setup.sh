@@ -1,0 +1,13 @@
+# On the lent machine, in the tree's root: unpacks, checks that all is there, starts the queue in a session of its own.
+set -e
+mkdir -p /tmp/site /tmp/repo /tmp/runs /tmp/mps /tmp/mpslog
+cat /tmp/a /tmp/b /tmp/c | tar xJ -C /tmp/site
+cp -r pmt_jax envs configs bench .ci pyproject.toml /tmp/repo/
+nvidia-smi --query-gpu=name --format=csv,noheader | tee /tmp/runs/gpus
+export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mpslog PYTHONPATH=/tmp/site:/tmp/repo
+nvidia-cuda-mps-control -d
+cd /tmp/repo
+python3 -m pmt_jax --help > /dev/null
+python3 -m bench list > /dev/null
+setsid taskset -c "0-$(($(nproc) / 2 - 1))" python3 .ci/lease/queue_runs.py > /tmp/runs/queue.out 2>&1 &
+[ ! -e .ci/lease/cpu.sh ] || setsid taskset -c "$(($(nproc) / 2))-$(($(nproc) - 1))" bash .ci/lease/cpu.sh > /tmp/runs/cpu.out 2>&1 &
