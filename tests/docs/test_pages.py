@@ -59,6 +59,7 @@ STATED: dict[str, dict[str, str]] = {
     "results/scaling.md": {
         "cores of a machine": "32",
         "quotients and products of the table's numbers": "8.9 19,064 35,568",
+        "an update of a probe: seconds, and its size divided by them": "0.90 9,062",
         "slowest and fastest turns in the stored results": "3,600 11,633 24,651 29,312",
     },
     "results/speed.md": {
@@ -98,9 +99,10 @@ STATED: dict[str, dict[str, str]] = {
         "coefficients of the rewards": "0.0001 0.001 0.5 1.25",
         "thresholds": "0.04891 0.9613 1.641 2.418 2.522 2.932 3.227",
         "bounds of actions and heights": "0.2 0.4",
-        "settings and seeds": "0.78 512 90 94",
+        "settings and seeds": "512 90 94",
         "ratios of rows of velocity.json": "1.22 1.06 1.28 1.11 0.95 0.92",
-        "steps and rates of the trial, and a run on a CPU": "10.2 306,000 412,000 38",
+        "steps and rates of the trials": "10.2 306,000 412,000 7.2 3.8 684,000 347,000 154,000 183,000",
+        "the highest cost of a run": "658",
         "versions of MuJoCo": "2.3 3.17",
         "bounds of tests": "2e-5 1e-3 1e-4",
     },
