@@ -18,15 +18,13 @@ if DEVICES > 1:
 
 import jax  # noqa: E402
 
-from envs.physics import c_engine  # noqa: E402
 from pmt_jax import load_config  # noqa: E402
 from pmt_jax.learning import learner, sharding  # noqa: E402
 from pmt_jax.learning.setup import make_setup  # noqa: E402
 from pmt_jax.learning.types import Hyper, LearnerState, Tag  # noqa: E402
 from pmt_jax.training import compile as programs_of  # noqa: E402
 
-if len(sys.argv) > 2:
-    c_engine.usable_cpus = lambda: int(sys.argv[2])
+THREADS = {"threads": int(sys.argv[2])} if len(sys.argv) > 2 else {}
 
 
 def median(call: Callable[[], Any], times: int = 7) -> tuple[float, float]:
@@ -39,7 +37,7 @@ def median(call: Callable[[], Any], times: int = 7) -> tuple[float, float]:
     return sorted(taken)[times // 2]
 
 
-config = load_config("ant_2x4", method="mappo_l", num_envs=256, rollout_length=32, seeds=1, log_interval=1)
+config = load_config("ant_2x4", env=THREADS, method="mappo_l", num_envs=256, rollout_length=32, seeds=1, log_interval=1)
 mesh = sharding.make_mesh(config, DEVICES)
 setup = dataclasses.replace(make_setup(config), mesh=mesh)
 state, programs = programs_of.compile_run(setup, lambda _: None)
@@ -56,7 +54,7 @@ with sharding.use_mesh(mesh):
     rollout = jax.jit(programs_of._over_seeds(setup, act, axes), out_shardings=placed).lower(hyper, state).compile()
 acting, whole = median(lambda: rollout(hyper, state)), median(lambda: programs.chunk(state))
 print(
-    f"devices {DEVICES}, threads {c_engine.usable_cpus()}, NPROC {os.environ.get('NPROC')}: "
+    f"devices {DEVICES}, {THREADS}, NPROC {os.environ.get('NPROC')}: "
     f"rollout {acting[0]:.3f} s ({acting[1]:.2f} CPU-s), update {whole[0]:.3f} s ({whole[1]:.2f} CPU-s)",
     flush=True,
 )
