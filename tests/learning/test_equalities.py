@@ -1,6 +1,6 @@
 """Equalities between methods: where what makes them differ is nothing, they are the same.
 
-Two programs round differently on some processors. They are compared up to rounding, unless they differ by a sum with zero.
+Two programs round differently on some processors. They are compared up to rounding, if more than a sum with 0 differs.
 """
 
 from __future__ import annotations
