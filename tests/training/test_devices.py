@@ -57,7 +57,7 @@ if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody 
 program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
 apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))
-         for path, x in whole.items() if x.dtype != bool and np.isfinite(x).all()}
+         for path, x in whole.items() if x.dtype != bool and np.isfinite(x).all() and path != "actor/case"}
 collective = r" = [^=]*? (?:all-gather|all-reduce|all-to-all|collective-permute)(?:-start)?\(.*"
 print(json.dumps({
     "leaves": len(apart),
@@ -70,7 +70,10 @@ print(json.dumps({
 
 
 def compare(task: str, **sizes: object) -> dict:
-    """A chunk of training on four devices: its program, and how far its end is from that on one (but for 4 seeds)."""
+    """A chunk of training on four devices: its program, and how far its end is from that on one (but for 4 seeds).
+
+    Which case a trust region's step came from is not compared: where two cases meet, rounding decides.
+    """
     command = [sys.executable, "-c", COMPARE, task, json.dumps(sizes)]
     done = subprocess.run(command, env=environment(XLA_FLAGS=FOUR), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
