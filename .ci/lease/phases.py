@@ -1,6 +1,7 @@
-"""Wall and CPU seconds of a rollout and of a whole update on a CPU: phases.py DEVICES [THREADS of each engine].
+"""Wall and CPU seconds of a rollout and of a whole update on a CPU: phases.py DEVICES [THREADS of each engine [FOLDER]].
 
-One seed of MAPPO-Lagrangian on ant_2x4, 256 environments x 32 steps; medians of seven.
+One seed of MAPPO-Lagrangian on ant_2x4, 256 environments x 32 steps; medians of seven. A rollout's trace goes into the
+folder: `jax.profiler.ProfileData.from_file` reads it.
 """
 
 from __future__ import annotations
@@ -58,4 +59,7 @@ print(
     f"rollout {acting[0]:.3f} s ({acting[1]:.2f} CPU-s), update {whole[0]:.3f} s ({whole[1]:.2f} CPU-s)",
     flush=True,
 )
+if len(sys.argv) > 3:
+    with jax.profiler.trace(sys.argv[3]):
+        jax.block_until_ready(rollout(hyper, state))
 os._exit(0)  # XLA's devices can wait for each other at the end

@@ -30,8 +30,8 @@ def log(*words: object) -> None:
 
 
 def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
-    """`command` is what follows `python -m`; a run of pmt gets its folder."""
-    if command[0] == "pmt_jax":
+    """`command` is what follows `python`; a run gets its folder."""
+    if "train" in command:
         command = [*command, "--out", str(OUT / "runs" / name)]
         if SMOKE:
             tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
@@ -40,8 +40,9 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     log("GPU", gpu, "starts", name)
     with open(OUT / "logs" / name.replace("/", "-"), "w") as file:
         where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": str(gpu)}
-        program = [sys.executable, "-m", *command]
-        return subprocess.Popen(program, env=os.environ | where, stdout=file, stderr=subprocess.STDOUT)
+        return subprocess.Popen(
+            [sys.executable, *command], env=os.environ | where, stdout=file, stderr=subprocess.STDOUT
+        )
 
 
 def main() -> None:
