@@ -92,7 +92,7 @@ class AntCorridor:
       sway: `none`, or the corridor moves along y by 1 m x sin(phase), a period in 10 s from a random phase: danger that
         is not where it was. `seen`: observations measure the place from where the centre line is now, and hold its
         velocity. `hidden`: they measure it from where the line is on average.
-      threads: of the `mujoco` engine; all usable CPUs if None.
+      threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
     @typed

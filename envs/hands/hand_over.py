@@ -169,7 +169,7 @@ class HandOver:
       full_hand: adds the 20 contacts inside each hand (fingers, thumb, palm) and the dry friction of its joints.
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
-      threads: of the `mujoco` engine; all usable CPUs if None.
+      threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
     @typed

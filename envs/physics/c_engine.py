@@ -42,14 +42,19 @@ class CEngine:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if model.ntree == 1:  # one tree is one island; the search for it takes 6 % of a step and changes no bit
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-        self._model, self._readout = model, dict(readout)
-        runner = TeamSteps if needs_post_constraint(readout) else BatchSteps
-        self._runner = runner(model, substeps, readout, threads)
+        self._model, self._substeps, self._readout, self._threads = model, substeps, dict(readout), threads
         views = after_step(mujoco.MjData(model), readout)
         ends = np.cumsum([view.size for view in views]).tolist()
         self._parts = [(slice(end - view.size, end), view.shape) for view, end in zip(views, ends, strict=True)]
         self._width = ends[-1]
         self._target = register(self._advance)
+
+    @functools.cached_property
+    def _runner(self) -> TeamSteps | BatchSteps:
+        """Made by the first step, as JAX has its devices by then. They call at the same time and share the threads."""
+        runner = TeamSteps if needs_post_constraint(self._readout) else BatchSteps
+        calls = jax.local_device_count() if jax.default_backend() == "cpu" else 1
+        return runner(self._model, self._substeps, self._readout, -(-self._threads // calls))
 
     def start(self) -> PhysicsState:
         return rest_state(self._model)

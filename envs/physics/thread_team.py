@@ -101,6 +101,7 @@ class _Team:
         """Forgets the threads, which do not survive a fork; new ones start when needed."""
         self._jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._size = 0
+        self._wanted: list[int] = []  # helpers, one entry for each call under way: devices call at the same time
 
     def share(self, work: Callable[[], None], queue: Iterator[Any], threads: int) -> None:
         """Runs `work`, which takes from `queue` until it is empty, on this thread and on `threads - 1` others.
@@ -127,8 +128,9 @@ class _Team:
             while inside:
                 left.get()
 
+        self._wanted.append(threads - 1)
         try:
-            for _ in range(min(threads - 1, self._recruit(threads - 1))):
+            for _ in range(min(threads - 1, self._recruit(sum(self._wanted)))):
                 self._jobs.put(assist)
             work()
         finally:
@@ -138,6 +140,7 @@ class _Team:
                     break
                 except KeyboardInterrupt:  # again: it takes no more than one environment's control step
                     continue
+            self._wanted.remove(threads - 1)
         if errors:
             raise errors[0]
 

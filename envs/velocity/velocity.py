@@ -87,7 +87,7 @@ class Velocity:
         keep running moments).
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
-      threads: of the `mujoco` engine; all usable CPUs if None.
+      threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
     @typed
