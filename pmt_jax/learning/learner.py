@@ -17,8 +17,7 @@ from .debug import check_finite, watched
 from .maths import lagrangian, running_moments
 from .maths.advantages import gae
 from .maths.losses import value_loss
-from .maths.running_moments import RunningMoments
-from .optimise import Fit, fit_all, init_train_state
+from .optimise import fit, init_train_state
 from .policy_update import in_lambda_unit, policy_rows, update_policies
 from .rollout import flatten_steps
 from .setup import Setup, make_setup
@@ -114,12 +113,11 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 Critics.
-    (critic, critic_metrics), (cost_critic, cost_critic_metrics) = _fit_critics(
-        setup,
-        hyper,
-        batch.state,
-        (state.critic, setup.nets.value, value, returns, tagged[Tag.CRITIC]),
-        (state.cost_critic, setup.nets.cost_value, cost_value, cost_returns, tagged[Tag.COST_CRITIC]),
+    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    fit_critic = functools.partial(_fit_critic, setup, hyper)
+    critic, critic_metrics = fit_critic(state.critic, setup.nets.value, rows, tagged[Tag.CRITIC])
+    cost_critic, cost_critic_metrics = fit_critic(
+        state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]
     )
 
     # 5 Coping response: every agent's policy, and its multipliers.
@@ -219,44 +217,29 @@ def _values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array,
     return value, next_value
 
 
-def _fit_critics(
+def _fit_critic(
     setup: Setup,
     hyper: Hyper,
-    states: jax.Array,
-    *critics: tuple[Critic, ValueFn, jax.Array, jax.Array, jax.Array],
-) -> list[tuple[Critic, Metrics]]:
-    """Updates each critic's moments of the returns once, then fits the critics to them in the new units.
+    critic: Critic,
+    value_fn: ValueFn,
+    rows: tuple[jax.Array, jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[Critic, Metrics]:
+    """Updates the moments of the returns once, then fits the critic to them in the new units.
 
     Args:
-      states: [T, B, S].
-      critics: each with its function, the values when they were collected and the returns, both [T, B, ...] in the
-        signal's unit, and a key.
+      rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
     """
-    moments = [
-        running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
-        for critic, _, _, returns, _ in critics
-    ]
+    state, old_value, returns = rows
+    moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
+    normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 
-    def to_fit(moments: RunningMoments, critic: Critic, value_fn: ValueFn, *rest: jax.Array) -> Fit:
-        def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
-            state, old, target = minibatch
-            return value_loss(value_fn(params, state), old, target, hyper.clip).mean(), {}
-
-        *signals, key = rest
-        normalised = (states, *(running_moments.normalise(moments, x) for x in signals))
-        return Fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key)
+    def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, old, target = minibatch
+        return value_loss(value_fn(params, state), old, target, hyper.clip).mean(), {}
 
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": hyper.critic_lr, "max_grad_norm": hyper.max_grad_norm}
-    fits = [to_fit(*each) for each in zip(moments, *zip(*critics, strict=True), strict=True)]
-    return [
-        (Critic(net, now), metrics | {"explained_variance": _explained(old_value, returns)})
-        for (net, metrics), now, (_, _, old_value, returns, _) in zip(
-            fit_all(fits, **limits, **passes), moments, critics, strict=True
-        )
-    ]
-
-
-def _explained(value: jax.Array, returns: jax.Array) -> jax.Array:
-    """Share of the returns' variance that the values explain."""
-    return 1 - jnp.var(returns - value) / jnp.maximum(jnp.var(returns), 1e-8)
+    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
+    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
+    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}

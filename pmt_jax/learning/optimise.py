@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,63 +35,40 @@ def shuffled(key: jax.Array, count: int) -> jax.Array:
     return jnp.sort(words | jnp.arange(count, dtype=jnp.uint32)) & (2**bits - 1)
 
 
-class Fit(NamedTuple):
-    """What `fit_all` trains.
-
-    Attributes:
-      net: weights and optimiser state.
-      loss: (params, minibatch) -> scalar and metrics; sees rows [R / minibatches, ...].
-      rows: pytree of [R, ...], R divisible by `minibatches`.
-      key: shuffles the rows anew in every epoch.
-    """
-
-    net: TrainState
-    loss: Loss
-    rows: Any
-    key: jax.Array
-
-
-def fit_all(
-    fits: Sequence[Fit],
+def fit(
+    net: TrainState,
+    loss: Loss,
+    rows: Any,
+    key: jax.Array,
     *,
     learning_rate: jax.Array | float,
     max_grad_norm: jax.Array | float,
     epochs: int,
     minibatches: int,
-) -> list[tuple[TrainState, Metrics]]:
-    """Minimises each loss by Adam over shuffled minibatches: `epochs` passes of `minibatches` steps each.
+) -> tuple[TrainState, Metrics]:
+    """Minimises `loss` by Adam over shuffled minibatches: `epochs` passes of `minibatches` steps each.
 
-    The networks know nothing of each other. One scan trains them all, as XLA runs what is independent in a step at the
-    same time, and one scan after the other.
+    Args:
+      net: weights and optimiser state.
+      loss: (params, minibatch) -> scalar and metrics; sees rows [R / minibatches, ...].
+      rows: pytree of [R, ...], R divisible by `minibatches`.
+      key: shuffles the rows anew in every epoch.
 
     Returns:
-      Each trained network, and its loss (`loss`) with its metrics, means over the last epoch.
+      The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
-    rows = [sharding.replicate(one.rows) for one in fits]
-    orders = [_order(one.key, jax.tree.leaves(one.rows)[0].shape[0], epochs, minibatches) for one in fits]
+    rows = sharding.replicate(rows)
+    count = jax.tree.leaves(rows)[0].shape[0]
+    shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
-    def step(one: Fit, rows: Any, net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
+    def step(net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
         minibatch = sharding.shard(jax.tree.map(lambda x: x[index], rows))
-        (value, metrics), gradient = jax.value_and_grad(one.loss, has_aux=True)(net.params, minibatch)
+        (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
         norm = optax.tree.norm(gradient)
         shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
         direction, opt_state = _ADAM.update(jax.tree.map(lambda g: g * shrink, gradient), net.opt_state)
         params = jax.tree.map(lambda p, d: p - learning_rate * d, net.params, direction)
         return TrainState(params, opt_state), {"loss": value, "grad_norm": norm, **metrics}
 
-    def steps(nets: list[TrainState], indices: list[jax.Array]) -> tuple[list[TrainState], list[Metrics]]:
-        stepped = [step(*each) for each in zip(fits, rows, nets, indices, strict=True)]
-        return [net for net, _ in stepped], [metrics for _, metrics in stepped]
-
-    nets, metrics = jax.lax.scan(steps, [one.net for one in fits], orders)
-    return list(zip(nets, jax.tree.map(lambda x: x[-minibatches:].mean(0), metrics), strict=True))
-
-
-def fit(net: TrainState, loss: Loss, rows: Any, key: jax.Array, **options: Any) -> tuple[TrainState, Metrics]:
-    """`fit_all` of one network."""
-    return fit_all([Fit(net, loss, rows, key)], **options)[0]
-
-
-def _order(key: jax.Array, count: int, epochs: int, minibatches: int) -> jax.Array:
-    """Rows of each minibatch, [epochs * minibatches, count / minibatches]."""
-    return jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs)).reshape(epochs * minibatches, -1)
+    net, metrics = jax.lax.scan(step, net, shuffle.reshape(epochs * minibatches, -1))
+    return net, jax.tree.map(lambda x: x[-minibatches:].mean(0), metrics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from pmt_jax.learning.maths import distributions, lagrangian, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
 from pmt_jax.learning.maths.losses import clipped_surrogate, huber, hybrid_advantage, value_loss
 from pmt_jax.learning.networks import LayerNorm
-from pmt_jax.learning.optimise import Fit, fit, fit_all, init_train_state, shuffled
+from pmt_jax.learning.optimise import fit, init_train_state, shuffled
 
 
 def column(x: list[float], dtype: type = float) -> jax.Array:
@@ -275,24 +274,6 @@ def test_fit_scales_gradients_down_to_the_given_norm():
     # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
     np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)
     np.testing.assert_allclose(metrics["grad_norm"], 2e6, rtol=1e-5)
-
-
-def test_networks_that_are_fitted_together_end_as_those_fitted_alone():
-    """With rows and losses of their own: neither their order nor their number of weights matters to another."""
-
-    def loss(params: jax.Array, rows: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-        inputs, target = rows
-        return jnp.mean((inputs @ params - target) ** 2), {}
-
-    def of_width(width: int) -> Fit:
-        x, y = (jax.random.normal(jax.random.key(i), shape) for i, shape in enumerate([(32, width), (32,)]))
-        return Fit(init_train_state(jnp.zeros(width)), loss, (x, y), jax.random.key(width))
-
-    options = {"learning_rate": 0.05, "max_grad_norm": 1.0, "epochs": 3, "minibatches": 4}
-    fits = [of_width(3), of_width(5)]
-    for (net, metrics), one in zip(fit_all(fits, **options), fits, strict=True):
-        alone, alone_metrics = fit(*one, **options)
-        chex.assert_trees_all_close((net, metrics), (alone, alone_metrics), rtol=1e-5)
 
 
 def test_layer_normalisation_is_what_its_name_says():
