@@ -1,4 +1,4 @@
-"""Wall and CPU seconds of a rollout and of a whole update on a CPU: phases.py DEVICES [THREADS of each engine [FOLDER]].
+"""Wall and CPU seconds of a rollout and of an update on a CPU: phases.py DEVICES [THREADS of the engine [FOLDER]].
 
 One seed of MAPPO-Lagrangian on ant_2x4, 256 environments x 32 steps; medians of seven. A rollout's trace goes into the
 folder: `jax.profiler.ProfileData.from_file` reads it.
