@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import envs
 from envs import physics
 from envs.ant import corridor
 from envs.errors import TaskError
@@ -155,6 +156,27 @@ def test_team_does_each_piece_once_and_leaves_nobody_behind():
 
         team.share(work, queue, threads)
         assert sorted(taken) == list(range(50)) and not at_work
+
+
+def test_calls_at_the_same_time_have_helpers_of_their_own():
+    team, everyone, done = thread_team._Team(), threading.Barrier(4), []
+
+    def call():
+        team.share(lambda: done.append(everyone.wait(60)), iter(()), 2)  # nobody passes before all four are there
+
+    callers = [threading.Thread(target=call) for _ in range(2)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert sorted(done) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("devices", [1, 3, 16])
+def test_devices_share_the_threads(devices: int, monkeypatch: pytest.MonkeyPatch):
+    engine = envs.make("velocity_half_cheetah_2x3", physics="mujoco", threads=8)._engine
+    monkeypatch.setattr(jax, "local_device_count", lambda: devices)
+    assert engine._runner._threads == {1: 8, 3: 3, 16: 1}[devices]
 
 
 @pytest.mark.parametrize("guilty", ["the caller", "a helper"])
