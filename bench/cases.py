@@ -172,7 +172,7 @@ BENCHES = {
         (
             *_plain("ant_2x4")[1:],
             *_alone("ant_2x4", (64, 256), physics="mujoco"),
-            _training("ant_2x4", "mappo_l", 1, 256, 32),
+            *(_training("ant_2x4", "mappo_l", 1, 256, 32, devices=count) for count in (1, 2, 4)),
             _training("ant_2x4", "mappo_l", 1, 64, 64),
             *_in_jobs("ant_2x4", 8, (1, 2, 4, 8)),
             *_in_jobs("ant_2x4", 16, (1, 4, 8, 16)),

@@ -74,10 +74,13 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
 
     from . import measure as measuring
 
-    jax.config.update("jax_enable_compilation_cache", False)
-    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     bench, rows = BENCHES[name], []
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
+    if name != "grid" and bench.on == "cpu":  # before JAX starts; on one device it keeps all threads
+        shared = max((case.devices for case in cases), default=1)
+        jax.config.update("jax_num_cpu_devices", min(shared, measuring.usable_cpus()))
+    jax.config.update("jax_enable_compilation_cache", False)
+    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     flags = " --quick" * quick + f" --threads {threads}" * bool(threads) + f" --only '{only}'" * bool(only)
     for row in measuring.rows(bench, cases, measuring.QUICK if quick else measuring.FULL, say):
         rows.append(row)

@@ -1,5 +1,9 @@
-# keep.sh 1, then keep.sh 2: checkpoints in parts of 16 MiB, four a call.
+# keep.sh N: the newest checkpoints of runs that can go on, in parts of 16 MiB: the N-th four of them.
 mkdir -p /tmp/parts && cd /tmp/parts
-[ "$1" = 2 ] || tar cf - -C /tmp runs | xz -T16 -1 | split -b 15900000 - part
+if [ "$1" = 1 ]; then
+  for run in $(grep -hao '[^ ]* --resume' /tmp/runs/logs/* | cut -d ' ' -f 1 | sort -u); do
+    echo "$run"/{config.toml,versions.json,metrics.jsonl} "$run/checkpoints/$(ls "$run/checkpoints" | sort -n | tail -1)" | tr ' ' '\n'
+  done | tar cf - -T - | xz -T0 -1 | split -b 15900000 - part
+fi
 ls -l
 ls | tail -n "+$((4 * $1 - 3))" | head -4 | xargs -I{} cp {} "$OUT/"

@@ -383,7 +383,15 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "workstation": Table(
         "workstation",
         EVERY,
-        ("", SIZES, "worker processes", "environment steps/s", "steps per CPU-second", "of a plain loop on each core"),
+        (
+            "",
+            SIZES,
+            "worker processes",
+            "devices",
+            "environment steps/s",
+            "steps per CPU-second",
+            "of a plain loop on each core",
+        ),
     ),
     "velocity": Table("velocity", EVERY, ("task", *SPEED, CPU_SECONDS[0])),
     "methods": Table(
