@@ -76,9 +76,11 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
 
     bench, rows = BENCHES[name], []
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
-    if name != "grid" and bench.on == "cpu":  # before JAX starts; on one device it keeps all threads
-        shared = max((case.devices for case in cases), default=1)
-        jax.config.update("jax_num_cpu_devices", min(shared, measuring.usable_cpus()))
+    if name != "grid" and bench.on == "cpu":  # before JAX starts; a row of one device still has all threads
+        cores = measuring.usable_cpus()
+        shared = min(cores, max((case.devices for case in cases), default=1))
+        os.environ.setdefault("NPROC", str(max(cores, 2 * shared)))  # see processes.make_room
+        jax.config.update("jax_num_cpu_devices", shared)
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     flags = " --quick" * quick + f" --threads {threads}" * bool(threads) + f" --only '{only}'" * bool(only)
