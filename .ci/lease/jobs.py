@@ -4,22 +4,37 @@ END = 1620.0  # seconds after asking
 PROGRAMS = 2  # at a time on a GPU: with more, 20 seeds of ten million steps do not end in a lease
 
 PMT = ["-m", "pmt_jax"]
-ANT = ["train", "paper/ant_2x4", "--cost-margin=0.5"]
+ANT = ["train", "paper/ant_2x4", "--cost-margin=0.5", "--seed=460", "--seeds=20"]
 MULTIPLIER = "--cost-estimate=average --lambda-unit=relative --lambda-lr=0.006 --lambda-max=100".split()
-SEEDS = ["--seed=460", "--seeds=20"]
-MACPO = "--limit-lr=0.1 --kl-limit=0.03".split()
-TRIAL = [*MACPO, "--seed=90", "--seeds=4", "--cost-limit=1"]
+PID = ["--lambda-rule=pid", "--lambda-kp=0.5"]
+GRID = "train voltage_141 --seed=94 --seeds=5 --num-envs=128 --steps=4e6 --log-interval=20 --cost-limit=1.6".split()
 
 # The study of limits (bench/sweeps/limits.toml) in the order of docs/appendix/preregistration.md.
 JOBS = [
+    ["limits/macpo-10", *PMT, "train", "/tmp/runs/runs/limits/macpo-10/config.toml", "--resume"],
     *(
-        [f"limits/{method}-{limit}", *PMT, *ANT, *MULTIPLIER, *SEEDS, f"--method={method}", f"--cost-limit={limit}"]
-        for limit in (0.2, 1)
-        for method in ("mappo_l", "f4sg")
+        [f"limits/{method}-{limit}", *PMT, *ANT, *MULTIPLIER, f"--method={method}", f"--cost-limit={limit}"]
+        for method, limit in (("mappo_l", 10), ("f4sg", 10), ("r4sg", 1))
     ),
-    # What may make MACPO keep a limit of 1 (docs/results/limits.md): four times the batch, or fear as the cost.
-    ["trial/macpo-batch", *PMT, *ANT, *TRIAL, "--method=macpo", "--rollout-length=128"],
-    ["trial/macpo-fear", ".ci/lease/macpo_fear.py", *ANT, *TRIAL, "--method=macpo_fear"],
-    ["limits/macpo-10", *PMT, *ANT, *MACPO, "--seed=440", "--seeds=20", "--method=macpo", "--cost-limit=10"],
-    ["limits/mappo_l-10", *PMT, *ANT, *MULTIPLIER, *SEEDS, "--method=mappo_l", "--cost-limit=10"],
+    # 141 buses until nothing moves (docs/tasks/voltage.md): other seeds, to find the setting.
+    *(
+        [
+            f"grid/{name}",
+            *PMT,
+            *GRID,
+            "--lambda-max=200",
+            "--lr-half-life=1e6",
+            f"--lambda-unit={unit}",
+            f"--lambda-lr={lr}",
+        ]
+        for name, unit, lr in (("slow", "limit", 0.1), ("fast", "limit", 0.5), ("relative", "relative", 0.02))
+    ),
+    *(
+        [f"limits/{name}-{limit}", *PMT, *ANT, *MULTIPLIER, *more, f"--method={method}", f"--cost-limit={limit}"]
+        for name, method, limit, more in (
+            ("r4sg", "r4sg", 0.2, []),
+            ("pid", "mappo_l", 1, PID),
+            ("pid", "mappo_l", 0.2, PID),
+        )
+    ),
 ]
