@@ -1,5 +1,7 @@
 """The next lease's runs, first things first: names, and what follows `python`."""
 
+import os
+
 END = 1620.0  # seconds after asking
 PROGRAMS = 2  # at a time on a GPU: with more, 20 seeds of ten million steps do not end in a lease
 
@@ -7,11 +9,14 @@ PMT = ["-m", "pmt_jax"]
 ANT = ["train", "paper/ant_2x4", "--cost-margin=0.5", "--seed=460", "--seeds=20"]
 MULTIPLIER = "--cost-estimate=average --lambda-unit=relative --lambda-lr=0.006 --lambda-max=100".split()
 PID = ["--lambda-rule=pid", "--lambda-kp=0.5"]
+STARTED = "/tmp/runs/runs/limits/macpo-10/config.toml"  # from .p4/d; without it the run starts anew
+MACPO = "train paper/ant_2x4 --method=macpo --seed=440 --seeds=20 --cost-limit=10 --cost-margin=0.5".split()
+MACPO += "--limit-lr=0.1 --kl-limit=0.03".split()
 GRID = "train voltage_141 --seed=94 --seeds=5 --num-envs=128 --steps=4e6 --log-interval=20 --cost-limit=1.6".split()
 
 # The study of limits (bench/sweeps/limits.toml) in the order of docs/appendix/preregistration.md.
 JOBS = [
-    ["limits/macpo-10", *PMT, "train", "/tmp/runs/runs/limits/macpo-10/config.toml", "--resume"],
+    ["limits/macpo-10", *PMT, *(["train", STARTED, "--resume"] if os.path.exists(STARTED) else MACPO)],
     *(
         [f"limits/{method}-{limit}", *PMT, *ANT, *MULTIPLIER, f"--method={method}", f"--cost-limit={limit}"]
         for method, limit in (("mappo_l", 10), ("f4sg", 10))
