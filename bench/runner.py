@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 
+from envs.physics import usable_cpus
 from pmt_jax.errors import UsageError
 
 from . import compare, grid, records
@@ -76,10 +77,9 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
 
     bench, rows = BENCHES[name], []
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
-    if name != "grid" and bench.on == "cpu":  # before JAX starts; a row of one device still has all threads
-        cores = measuring.usable_cpus()
-        shared = min(cores, max((case.devices for case in cases), default=1))
-        os.environ.setdefault("NPROC", str(max(cores, 2 * shared)))  # see processes.make_room
+    shared = min(usable_cpus(), max((case.devices for case in cases), default=1))
+    if bench.on == "cpu" and shared > 1:  # before JAX starts
+        os.environ.setdefault("NPROC", str(max(usable_cpus(), 2 * shared)))  # see processes.make_room
         jax.config.update("jax_num_cpu_devices", shared)
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)

@@ -2,7 +2,7 @@
 mkdir -p /tmp/parts && cd /tmp/parts
 if [ "$1" = 1 ]; then
   for run in $(grep -hao '[^ ]* --resume' /tmp/runs/logs/* | cut -d ' ' -f 1 | sort -u); do
-    echo "$run"/{config.toml,versions.json,metrics.jsonl} "$run/checkpoints/$(ls "$run/checkpoints" | sort -n | tail -1)" | tr ' ' '\n'
+    printf '%s\n' "$run"/{config.toml,versions.json,metrics.jsonl} "$run/checkpoints/$(ls "$run/checkpoints" | sort -n | tail -1)"
   done | tar cf - -T - | xz -T0 -1 | split -b 15900000 - part
 fi
 ls -l

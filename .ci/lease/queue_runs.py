@@ -30,9 +30,12 @@ def log(*words: object) -> None:
 
 
 def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
-    """`command` is what follows `python`; a run gets its folder."""
+    """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
     if "train" in command:
-        command = [*command, "--out", str(OUT / "runs" / name)]
+        begun = OUT / "runs" / name / "config.toml"
+        if begun.exists():
+            command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
+        command = [*command, "--out", str(begun.parent)]
         if SMOKE:
             tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
             command += tiny.split()
@@ -46,7 +49,7 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
 
 
 def main() -> None:
-    queue, running = [job for job in jobs.JOBS if not (SMOKE and "--resume" in job)], []
+    queue, running = list(jobs.JOBS.items()), []
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
@@ -54,8 +57,8 @@ def main() -> None:
                 running.remove((gpu, name, process))
         at = [sum(gpu == one for gpu, _, _ in running) for one in range(GPUS)]
         if queue and min(at) < jobs.PROGRAMS:
-            name, *command = queue.pop(0)
-            running.append((at.index(min(at)), name, start(at.index(min(at)), name, command)))
+            name, command = queue.pop(0)
+            running.append((at.index(min(at)), name, start(at.index(min(at)), name, command.split())))
         else:
             time.sleep(1)
     for _, _, process in running:

@@ -2,7 +2,7 @@
 set -e
 mkdir -p /tmp/site /tmp/repo /tmp/runs /tmp/mps /tmp/mpslog
 cat /tmp/a /tmp/b /tmp/c | tar xJ -C /tmp/site
-[ ! -e /tmp/d ] || { mkdir -p /tmp/runs/runs/limits && tar xJf /tmp/d -C /tmp/runs/runs/limits; }
+[ ! -e /tmp/d ] || tar xJf /tmp/d -C / # runs that an earlier lease began
 cp -r pmt_jax envs configs bench .ci pyproject.toml /tmp/repo/
 nvidia-smi --query-gpu=name --format=csv,noheader | tee /tmp/runs/gpus
 export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mpslog PYTHONPATH=/tmp/site:/tmp/repo
