@@ -16,10 +16,10 @@ GRID += " --lambda-max=200 --lr-half-life=1e6"
 JOBS = {
     "limits/macpo-10": f"{MACPO} --seed=440 --seeds=20 --cost-limit=10 --cost-margin=0.5 --kl-limit=0.03",
     "limits/mappo_l-10": f"{STUDY} --method=mappo_l --cost-limit=10",
-    "limits/f4sg-10": f"{STUDY} --method=f4sg --cost-limit=10",
     "trial/macpo-margin": f"{MACPO} --seed=90 --seeds=4 --cost-limit=1 --cost-margin=0.9 --kl-limit=0.01",
-    "grid/slow": f"{GRID} --lambda-unit=limit --lambda-lr=0.1",
     "grid/fast": f"{GRID} --lambda-unit=limit --lambda-lr=0.5",
+    "limits/f4sg-10": f"{STUDY} --method=f4sg --cost-limit=10",
+    "grid/slow": f"{GRID} --lambda-unit=limit --lambda-lr=0.1",
     "grid/relative": f"{GRID} --lambda-unit=relative --lambda-lr=0.02",
     "limits/r4sg-1": f"{STUDY} --method=r4sg --cost-limit=1",
     "limits/r4sg-0.2": f"{STUDY} --method=r4sg --cost-limit=0.2",

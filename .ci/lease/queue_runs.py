@@ -48,6 +48,11 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
+def taken(gpu: int) -> int:
+    """Programs that have no room on a GPU while first.sh measures there."""
+    return jobs.PROGRAMS * (OUT / f"quiet-{gpu}").exists()
+
+
 def main() -> None:
     queue, running = list(jobs.JOBS.items()), []
     while time.time() - BEGIN < END and (queue or running):
@@ -55,7 +60,7 @@ def main() -> None:
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        at = [sum(gpu == one for gpu, _, _ in running) for one in range(GPUS)]
+        at = [sum(gpu == one for gpu, _, _ in running) + taken(one) for one in range(GPUS)]
         if queue and min(at) < jobs.PROGRAMS:
             name, command = queue.pop(0)
             running.append((at.index(min(at)), name, start(at.index(min(at)), name, command.split())))

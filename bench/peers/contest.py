@@ -47,7 +47,7 @@ class Effort(NamedTuple):
     elsewhere: float
 
 
-FULL, QUICK = Effort(3, 60.0, 10.0), Effort(1, 10.0, 5.0)
+FULL, ON_GPU, QUICK = Effort(3, 60.0, 10.0), Effort(2, 15.0, 6.0), Effort(1, 10.0, 5.0)
 _EACH = "2 actors, 2 critics of 128-128; cost"
 PEERS = {
     "plain": Peer("Python loops over C MuJoCo", f"{learners.TASK}, random actions", "none", learners.plain),
@@ -70,20 +70,22 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
     Raises:
       UsageError: figures of `quick` would replace the real ones.
     """
-    effort, (_, device) = QUICK if quick else FULL, runner.devices()
+    _, device = runner.devices()
+    effort = QUICK if quick else FULL if device == "cpu" else ON_GPU
     folder = runner.folder(out.parent if out else None, quick)
     out = out or folder / ("peers.json" if device == "cpu" else f"peers_{runner.slug(device)}.json")
     shape = (16, 16) if quick else (64, 64) if device == "cpu" else (2048, 8)
     sizes: dict[str, int] = dict(zip(SIZES, (*shape, 5, 8), strict=True))
     flags = " --quick" * quick + " --jaxmarl FOLDER" * bool(jaxmarl)
     turns: dict[str, list[Row]] = {name: [] for name in PEERS}
-    cache = tempfile.TemporaryDirectory()  # of compiled programs, empty in the first turn
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = cache.name
+    caches = tempfile.TemporaryDirectory()  # of compiled programs and kernels, empty in a peer's first turn
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # naming the device then takes no memory
     for turn in range(effort.turns):
         for name, peer in PEERS.items():
             if turns[name] and "failed" in turns[name][-1]:
                 continue
+            for cache in ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH"):
+                os.environ[cache] = str(pathlib.Path(caches.name) / name / cache)
             seconds = effort.seconds if peer.task == learners.TASK else effort.elsewhere
             turns[name].append(figures(_turn(name, seconds, turn, sizes, jaxmarl), seconds))
             say(f"[{turn + 1}/{effort.turns}] {peer.name}: {turns[name][-1]}")
