@@ -215,8 +215,8 @@ class Config(Hyper):
     lambda_unit: Literal["step", "limit", "relative"] = constraint(
         "step",
         "unit of the excess that changes the multiplier: cost per step, or share of the limit, cut at 1, so that one "
-        "lambda_lr fits all limits and horizons; relative: that share, and the multiplier changes in proportion to "
-        "itself, so that it becomes large soon where a tight limit needs it",
+        "lambda_lr fits all limits and horizons; relative: share of the limit less the margin, and the multiplier "
+        "changes in proportion to itself, so that it becomes large soon where a tight limit needs it",
     )
     lambda_rule: Literal["integral", "pid"] = constraint(
         "integral",

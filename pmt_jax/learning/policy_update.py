@@ -174,7 +174,9 @@ def in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:
     """An excess [..., K] in cost per step, in the unit that the multiplier's gains are for."""
     if setup.config.lambda_unit == "step":
         return excess
-    return lagrangian.in_limits(excess, jnp.asarray(hyper.cost_limit), setup.vector.horizon)
+    # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
+    margin = hyper.cost_margin if setup.config.lambda_unit == "relative" else 0.0
+    return lagrangian.in_limits(excess, lagrangian.held_limit(hyper.cost_limit, margin), setup.vector.horizon)
 
 
 def update_policy(

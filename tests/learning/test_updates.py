@@ -17,6 +17,7 @@ from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.config.settings import Hyper
 from pmt_jax.learning import learner, rollout
 from pmt_jax.learning.maths import lagrangian
+from pmt_jax.learning.policy_update import in_lambda_unit
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import LearnerState
 from small import SMALL, acted, program, trained, weights
@@ -237,6 +238,14 @@ def test_a_cut_excess_of_the_average_sees_rare_costs_that_cut_rates_miss():
 
     np.testing.assert_allclose(drift("rate"), (1 - 4 * 0.5) / 5, rtol=1e-5)
     np.testing.assert_allclose(drift("average"), 1.0 - 0.5, rtol=0.1)
+
+
+def test_without_costs_a_relative_multiplier_falls_as_fast_as_it_rises_with_too_many():
+    """Whatever the margin is; equal steps are shares of the whole limit, of which the margin leaves a half."""
+    excess = lagrangian.cost_excess(jnp.asarray([0.0, 9.0]), lagrangian.held_limit(2.0, 0.5), 25)
+    for unit, shares in ("relative", [-1, 1]), ("limit", [-0.5, 1]):
+        setup = make_setup(load_config("lane", method="mappo_l", lambda_unit=unit, **SMALL))
+        assert in_lambda_unit(setup, hyper_of(setup, 2.0, cost_margin=0.5), excess).tolist() == shares
 
 
 def test_share_of_episodes_within_and_cost_beyond_the_limit():

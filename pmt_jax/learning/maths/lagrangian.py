@@ -23,7 +23,8 @@ def held_limit(cost_limit: jax.Array | float | tuple[float, ...], cost_margin: j
 def in_limits(excess: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
     """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
 
-    An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit.
+    An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit. Where a
+    margin is kept, the excess over `held_limit` can be a share of the limit or of what it is held to.
     """
     return jnp.clip(excess * horizon / jnp.maximum(cost_limit, 1e-6), -1.0, 1.0)
 
