@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import dataclasses
+import functools
 import os
 import pathlib
 import re
+import shutil
 import statistics
 import subprocess
 import sys
@@ -35,10 +39,17 @@ CACHES = ("XDG_CACHE_HOME", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")  # of JAX, of 
 
 def start(case: Case) -> Row:
     """Trains in a process of its own with empty caches; the second start has what the first left in them."""
-    with tempfile.TemporaryDirectory() as folder:
-        if case.what == "second start":
-            _train(pathlib.Path(folder), case)
-        return _train(pathlib.Path(folder), case)
+    if case.what == "second start":
+        return _train(_first_start(dataclasses.replace(case, what="empty cache"))[0], case)
+    return _first_start(case)[1]
+
+
+@functools.cache
+def _first_start(case: Case) -> tuple[pathlib.Path, Row]:
+    """The folder of the caches, which is gone when this process ends, and the row."""
+    folder = pathlib.Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder, _train(folder, case)
 
 
 def _train(folder: pathlib.Path, case: Case) -> Row:

@@ -79,7 +79,8 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
     shared = min(usable_cpus(), max((case.devices for case in cases), default=1))
     if bench.on == "cpu" and shared > 1:  # before JAX starts
-        os.environ.setdefault("NPROC", str(max(usable_cpus(), 2 * shared)))  # see processes.make_room
+        # Fewer than processes.make_room has: rows of one device share this process, and train with a thread a core.
+        os.environ.setdefault("NPROC", str(max(usable_cpus(), 2 * shared)))
         jax.config.update("jax_num_cpu_devices", shared)
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)

@@ -94,6 +94,8 @@ train lane --lambda-max 0.1 | lambda_init = 0.78 lies above lambda_max = 0.1
 train lane --lambda-unit relative --lambda-init 0 | with lambda_unit = relative a multiplier of 0 never moves
 train lane --physics= | physics = '' does not fit: expected auto | mjx
 train lane --env num_agents | env = ['num_agents'] does not fit: expected name=value
+train ant_2x4 --env physics=warp | 'physics' is no option of a task; set physics = ... (--physics)
+train lane --env name=3 | 'name' is no option of a task; name the task itself
 train lane --env =3 | task 'lane' has no option ''
 train lane --env num_agents=0 | num_agents must be at least 1, not 0
 train lane --env num_agents=true | num_agents must be a whole number, not True

@@ -42,9 +42,10 @@ STATED: dict[str, dict[str, str]] = {
     },
     "results/limits.md": {
         "limits and margins": "10",
-        "seeds": "3 420 439 460 479",
-        "means and interquartile means of limits_relative_h200.json and Table 1": "0.13 5,070 5,001",
-        "multipliers in the stored runs": "7 12 53",
+        "seeds": "3 420 439 440 459 460 479",
+        "means and interquartile means of limits_relative_h200.json and Table 1, and a quotient": "0.13 5,070 5,001 0.87",
+        "multipliers in the stored runs": "6 7 12 53",
+        "a setting, and a commit": "0.03 8775164",
         "rates": "204,000 217,000",
         "updates": "60",
         "level of intervals": "95",
@@ -54,7 +55,7 @@ STATED: dict[str, dict[str, str]] = {
     "results/scaling.md": {
         "cores of a machine": "32",
         "quotients and products of the table's numbers": "8.9 19,064 35,568",
-        "an update of a probe: seconds, and its share of plain loops": "0.75 0.88 0.57",
+        "an update of a probe: seconds, and its share of plain loops": "0.75 0.88 0.57 0.99 1.1 1.8",
         "slowest and fastest turns in the stored results": "3,600 11,633 24,651 29,312",
     },
     "results/speed.md": {
