@@ -183,7 +183,12 @@ def state_like(setup: Setup) -> LearnerState:
 def initial_best(state: LearnerState) -> Best:
     """Before anything is known of a run of any number of seeds."""
     nothing = np.full(state.update.shape, np.inf, np.float32)
-    return Best(jax.tree.map(jnp.copy, state), -nothing, nothing)
+    return Best(_copy(state), -nothing, nothing)
+
+
+@jax.jit
+def _copy(state: LearnerState) -> LearnerState:
+    return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
 
 
 def load_saved(
