@@ -31,8 +31,8 @@ def log(*words: object) -> None:
 
 def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
-    if "train" in command:
-        begun = OUT / "runs" / name / "config.toml"
+    if "train" in command or "sweep" in command:
+        begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
         if begun.exists():
             command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
         command = [*command, "--out", str(begun.parent)]
