@@ -17,6 +17,7 @@ OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
 GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
+Running = tuple[tuple[int, ...], str, subprocess.Popen[bytes]]
 ENVIRONMENT = {  # beside what setup.sh exports
     "PYTHONUNBUFFERED": "1",
     "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
@@ -29,41 +30,44 @@ def log(*words: object) -> None:
     print(f"{time.time() - BEGIN:.0f} s", *words, flush=True)
 
 
-def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
+def start(gpus: tuple[int, ...], name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
-    if "train" in command or "sweep" in command:
+    if "pmt_jax" in command:
         begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
         if begun.exists():
             command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
         command = [*command, "--out", str(begun.parent)]
-        if SMOKE:
+        if SMOKE and "reproduce" not in command:
             tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
             command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
-    log("GPU", gpu, "starts", name)
+    log("GPU", *gpus, "starts", name)
     with open(OUT / "logs" / name.replace("/", "-"), "w") as file:
-        where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": str(gpu)}
+        where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))}
         return subprocess.Popen(
             [sys.executable, *command], env=os.environ | where, stdout=file, stderr=subprocess.STDOUT
         )
 
 
-def taken(gpu: int) -> int:
-    """Programs that have no room on a GPU while first.sh measures there."""
-    return jobs.PROGRAMS * (OUT / f"quiet-{gpu}").exists()
+def room(running: list[Running], name: str) -> tuple[int, ...]:
+    """The GPUs for the next run: the one with the fewest programs; () if none has room. `all/` needs all, empty."""
+    at = [sum(gpu in gpus for gpus, _, _ in running) for gpu in range(GPUS)]
+    at = [jobs.PROGRAMS if (OUT / f"quiet-{gpu}").exists() else count for gpu, count in enumerate(at)]  # see first.sh
+    if name.startswith("all/"):
+        return () if any(at) else tuple(range(GPUS))
+    return (at.index(min(at)),) if min(at) < jobs.PROGRAMS else ()
 
 
 def main() -> None:
-    queue, running = list(jobs.JOBS.items()), []
+    queue, running = list(jobs.JOBS.items()), list[Running]()
     while time.time() - BEGIN < END and (queue or running):
-        for gpu, name, process in list(running):
+        for gpus, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
-                running.remove((gpu, name, process))
-        at = [sum(gpu == one for gpu, _, _ in running) + taken(one) for one in range(GPUS)]
-        if queue and min(at) < jobs.PROGRAMS:
+                running.remove((gpus, name, process))
+        if queue and (free := room(running, queue[0][0])):
             name, command = queue.pop(0)
-            running.append((at.index(min(at)), name, start(at.index(min(at)), name, command.split())))
+            running.append((free, name, start(free, name, command.split())))
         else:
             time.sleep(1)
     for _, _, process in running:
