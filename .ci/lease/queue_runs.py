@@ -32,7 +32,7 @@ def log(*words: object) -> None:
 
 def start(gpus: tuple[int, ...], name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
-    if "pmt_jax" in command:
+    if {"train", "sweep", "reproduce"} & set(command):
         begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
         if begun.exists():
             command = ["-m", "pmt_jax", "train", str(begun), "--resume"]

@@ -402,10 +402,6 @@ def _validate(config: Config) -> None:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
     if config.lambda_unit == "relative" and not config.lambda_init:
         raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
-    for option in ("name", "physics"):  # arguments of tasks.make
-        if option in dict(config.env):
-            hint = "set physics = ... (--physics)" if option == "physics" else "name the task itself"
-            raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
     _validate_sizes(config)
 
 

@@ -1,0 +1,28 @@
+"""`pmt` with a trust region that shrinks: kl_limit is multiplied by the square of the share left of the learning rates.
+
+A trust region's radius is MACPO's step size, and its square is a divergence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import jax
+import jax.numpy as jnp
+
+from pmt_jax.cli import main
+from pmt_jax.config.settings import Hyper
+from pmt_jax.learning import learner
+from pmt_jax.learning.setup import Setup
+
+plain = learner._annealed
+
+
+def annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
+    left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
+    return dataclasses.replace(plain(setup, hyper, update), kl_limit=hyper.kl_limit * left**2)
+
+
+learner._annealed = annealed
+sys.exit(main())
