@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import atexit
 import dataclasses
 import functools
 import os
 import pathlib
 import re
-import shutil
 import statistics
 import subprocess
 import sys
@@ -39,17 +37,15 @@ CACHES = ("XDG_CACHE_HOME", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")  # of JAX, of 
 
 def start(case: Case) -> Row:
     """Trains in a process of its own with empty caches; the second start has what the first left in them."""
-    if case.what == "second start":
-        return _train(_first_start(dataclasses.replace(case, what="empty cache"))[0], case)
-    return _first_start(case)[1]
+    folder, row = _first_start(dataclasses.replace(case, what="empty cache"))
+    return _train(pathlib.Path(folder.name), case) if case.what == "second start" else row
 
 
 @functools.cache
-def _first_start(case: Case) -> tuple[pathlib.Path, Row]:
-    """The folder of the caches, which is gone when this process ends, and the row."""
-    folder = pathlib.Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder, _train(folder, case)
+def _first_start(case: Case) -> tuple[tempfile.TemporaryDirectory[str], Row]:
+    """The folder that has the caches until this process ends, and the row."""
+    folder = tempfile.TemporaryDirectory()
+    return folder, _train(pathlib.Path(folder.name), case)
 
 
 def _train(folder: pathlib.Path, case: Case) -> Row:

@@ -6,9 +6,10 @@ END = 1620.0  # seconds after asking
 
 # The study of limits, trials first (docs/appendix/preregistration.md). On other seeds, the floor under the cost
 # advantages' spread with MAPPO-Lagrangian, and MACPO with a trust region that shrinks; MACPO's cell on the other ant.
+MULTIPLIER = "--cost-estimate=average --lambda-unit=relative --lambda-lr=0.005 --lambda-max=100"
 TRIAL = "sweep paper/ant_2x4 --seed=90 --steps=8.4e6"
 FLOORS = f"-m pmt_jax {TRIAL} --seeds=5 --method=mappo_l --set cost_std_floor=0.05,0.1,0.2,0.4 --cost-margin=0.5"
-FLOORS += " --cost-estimate=average --lambda-unit=relative --lambda-lr=0.005 --lambda-max=100"
+FLOORS += f" {MULTIPLIER}"
 MACPO = "--method=macpo --limit-lr=0.1 --kl-limit=0.03"
 SHRINK = f".ci/lease/macpo_shrink.py {TRIAL} --seeds=4 {MACPO} --cost-limit=1 --set lr_half_life=6.75e6,3e6"
 OTHER_ANT = f"-m pmt_jax train paper/ant_4x2 {MACPO}"
@@ -25,18 +26,16 @@ TRIALS = {
 
 # The cells of MAPPO-Lagrangian and F4SG (bench/sweeps/limits.toml): 40 trials a program, one on each GPU.
 ANT = "-m pmt_jax sweep paper/ant_2x4 --set cost_limit=0.2,1 --seed=480 --seeds=20 --cost-margin=0.5"
-MULTIPLIER = "--cost-estimate=average --lambda-unit=relative --lambda-lr=0.005 --lambda-max=100"
 CELLS = {f"limits/{method}": f"{ANT} --method={method} {MULTIPLIER}" for method in ("mappo_l", "f4sg")}
 
 # The velocity tasks' table: a lease holds the five light robots, or the two ants, or the humanoid.
 TASKS = ("half_cheetah_2x3", "half_cheetah_6x1", "swimmer_2x1", "hopper_3x1", "walker2d_2x3")
-METHODS = ("mappo", "happo", "mappo_l", "macpo", "f4sg", "r4sg", "mixed", "mappo_l --lambda-rule=pid --lambda-kp=0.5")
+METHODS = {method: method for method in ("mappo", "happo", "mappo_l", "macpo", "f4sg", "r4sg", "mixed")}
+METHODS["pid"] = "mappo_l --lambda-rule=pid --lambda-kp=0.5"
 VELOCITY = {
-    f"velocity/{task}-{method.replace(' --lambda-kp=0.5', '').replace(' --lambda-rule=', '-')}": (
-        f"-m pmt_jax train velocity_{task} --preset=benchmark --method={method}"
-    )
+    f"velocity/{task}-{name}": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={method}"
     for task in TASKS
-    for method in METHODS
+    for name, method in METHODS.items()
 }
 
 # Table 1 by one command on all GPUs, timed.

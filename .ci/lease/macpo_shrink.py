@@ -9,7 +9,6 @@ import dataclasses
 import sys
 
 import jax
-import jax.numpy as jnp
 
 from pmt_jax.cli import main
 from pmt_jax.config.settings import Hyper
@@ -20,8 +19,8 @@ plain = learner._annealed
 
 
 def annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
-    return dataclasses.replace(plain(setup, hyper, update), kl_limit=hyper.kl_limit * left**2)
+    rates = plain(setup, hyper, update)
+    return dataclasses.replace(rates, kl_limit=hyper.kl_limit * (rates.critic_lr / hyper.critic_lr) ** 2)
 
 
 learner._annealed = annealed

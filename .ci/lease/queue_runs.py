@@ -32,14 +32,13 @@ def log(*words: object) -> None:
 
 def start(gpus: tuple[int, ...], name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
-    if {"train", "sweep", "reproduce"} & set(command):
-        begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
-        if begun.exists():
-            command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
-        command = [*command, "--out", str(begun.parent)]
-        if SMOKE and "reproduce" not in command:
-            tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
-            command += tiny.split()
+    begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
+    if begun.exists():
+        command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
+    command = [*command, "--out", str(begun.parent)]
+    if SMOKE and "reproduce" not in command:
+        tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
+        command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
     log("GPU", *gpus, "starts", name)
     with open(OUT / "logs" / name.replace("/", "-"), "w") as file:

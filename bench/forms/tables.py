@@ -370,11 +370,6 @@ SPEED = ("", "engine", "environments", "environment steps/s", "of plain loop x t
 CPU_SECONDS = ("the same per CPU-second", "trace, CPU-s", "compile, CPU-s")
 EVERY = ("plain loop", "environment", "training")
 SIZES = "seeds x environments x steps"
-PEERS = (
-    *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
-    *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost"),
-    *("first update, s", "other work, CPUs"),
-)
 TABLES: dict[str, Callable[[Reports], str]] = {
     "ant": Table("ant", EVERY, SPEED),
     "starts": Table("ant", ("start",), ("what", "compile cache", "compile, s", "first update, s", "memory, GB")),
@@ -452,6 +447,19 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "beside": beside,
     "limits": limits,
     "side_by_side": side_by_side,
-    "peers": Table("peers", ("peer",), PEERS),
-    "gpu_peers": Table("peers_h100", ("peer",), PEERS),
+    "peers": Table(
+        "peers",
+        ("peer",),
+        (
+            *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
+            *(
+                "environment steps/s",
+                "of pmt train, MAPPO-L",
+                "turns' reward",
+                "turns' cost",
+                "first update, s",
+                "other work, CPUs",
+            ),
+        ),
+    ),
 }
