@@ -42,4 +42,4 @@ VELOCITY = {
 TABLE1 = {"all/table1": "-m pmt_jax reproduce table1 --budget=paper --jobs=14 --no-cache"}
 
 # Programs at a time on a GPU, and the runs. Two programs of 20 ants' seeds made 295,000 steps/s on an H100.
-PROGRAMS, JOBS = 2, TRIALS
+PROGRAMS, JOBS = 2, TRIALS | VELOCITY  # what of the table fits into the rest
