@@ -7,7 +7,13 @@ phases() { # POOL DEVICES: XLA's threads, of which pmt train takes 64 where one 
 }
 lscpu | grep -E 'Thread|Core|Socket|NUMA'
 while [ -e /tmp/runs/quiet-0 ] && [ "$(left)" -gt 1100 ]; do sleep 1; done
-for pool in 64 8 32 16; do phases $pool 4; done
-phases 8 1
-timeout "$(left)" python3 -m bench measure workstation --threads 8 --out /tmp/runs/workstation_8.json | tail -1
-timeout "$(left)" python3 -m bench measure workstation --threads 16 --out /tmp/runs/workstation_16.json | tail -1
+# The same with the rows gathered as before: three exchanges between devices a minibatch more.
+mkdir -p /tmp/before && cp -r /tmp/repo/. /tmp/before
+sed -i -e 's/, sharding.replicate(rows)))/, rows))/' -e 's/^    count = jax.tree/    rows = sharding.replicate(rows)\n&/' /tmp/before/pmt_jax/learning/optimise.py
+for turn in 1 2 3; do
+  for tree in /tmp/before /tmp/repo; do echo $tree && PYTHONPATH=/tmp/site:$tree phases 64 4; done
+  phases 64 8
+  phases 64 2
+  phases 8 1
+done
+timeout 120 python3 -m bench measure workstation --threads 8 --only "plain" --out /tmp/runs/plain_8.json | tail -1

@@ -2,6 +2,15 @@
 until [ $(($(date +%s) - $(cat /tmp/repo/.ci/lease/asked))) -ge "$1" ] || [ -e /tmp/runs/ended ]; do sleep 2; done
 cat /tmp/runs/queue.out
 for log in /tmp/runs/logs/*; do echo "$(basename "$log"): $(tail -c 200 "$log" | tr '\r' '\n' | tail -1)"; done
-tail -n 25 /tmp/runs/first.out /tmp/runs/start_*.txt /tmp/runs/cpu.out 2> /dev/null | cut -c 1-300
+for file in /tmp/runs/first.out /tmp/runs/start_*.txt; do echo "$file" && head -n 12 "$file" && tail -n 3 "$file"; done 2> /dev/null | cut -c 1-200
+tail -n 25 /tmp/runs/cpu.out | cut -c 1-300
 nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
-cd /tmp && tar cf - --exclude='runs/limits/*/checkpoints' --exclude='.group-*/run/checkpoints' runs | xz -T8 -3 > "$OUT/runs.tar.xz"
+cd /tmp && tar cf - --exclude=checkpoints runs | xz -T8 -3 > "$OUT/runs.tar.xz"
+# Policies apart and once: an archive that is too large stays there, and the metrics must not stay with it.
+for run in $(cd /tmp && ls -d runs/runs/velocity/*-{happo,f4sg} 2> /dev/null); do
+  name=$(basename "$run")
+  if grep -q '^done:' "/tmp/runs/logs/velocity-$name" && mkdir "/tmp/sent-$name" 2> /dev/null; then
+    tar cf - -C /tmp "$run/checkpoints" "$run/config.toml" | xz -T8 -3 > "$OUT/$name.tar.xz"
+  fi
+done
+true

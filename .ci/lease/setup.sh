@@ -2,6 +2,8 @@
 set -e
 mkdir -p /tmp/site /tmp/repo /tmp/runs /tmp/mps /tmp/mpslog
 cat /tmp/a /tmp/b /tmp/c | tar xJ -C /tmp/site
+unset PYTHONDONTWRITEBYTECODE # as where pip has installed it
+python3 -m compileall -q -j 8 /tmp/site > /dev/null 2>&1 || true
 [ ! -e /tmp/d ] || tar xJf /tmp/d -C / # runs that an earlier lease began
 cp -r pmt_jax envs configs bench .ci pyproject.toml /tmp/repo/
 nvidia-smi --query-gpu=name --format=csv,noheader | tee /tmp/runs/gpus

@@ -57,12 +57,11 @@ def fit(
     Returns:
       The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
-    rows = sharding.replicate(rows)
     count = jax.tree.leaves(rows)[0].shape[0]
     shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
     def step(net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
-        minibatch = sharding.shard(jax.tree.map(lambda x: x[index], rows))
+        minibatch = sharding.shard(jax.tree.map(lambda x: x[index], sharding.replicate(rows)))
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
         norm = optax.tree.norm(gradient)
         shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
