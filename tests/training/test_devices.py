@@ -87,6 +87,7 @@ def test_seeds_and_environments_split_change_nothing_but_rounding():
     assert found["leaves"] > 100 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
+    assert not [line for line in found["collectives"] if '/gather"' in line]  # nor to find the rows of a minibatch
 
 
 @pytest.mark.full
