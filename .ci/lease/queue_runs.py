@@ -36,7 +36,9 @@ def start(gpus: tuple[int, ...], name: str, command: list[str]) -> subprocess.Po
     if begun.exists():
         command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
     command = [*command, "--out", str(begun.parent)]
-    if SMOKE and "reproduce" not in command:
+    if SMOKE and "reproduce" in command:
+        command = [word.replace("=paper", "=smoke") for word in command]
+    elif SMOKE:
         tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
         command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
