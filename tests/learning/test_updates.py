@@ -284,8 +284,9 @@ def test_figures_of_episodes_count_finished_ones_only():
 
 def test_spread_starts_end_as_many_episodes_in_every_rollout_and_count_whole_ones():
     """Ten environments and rollouts of 5 steps: an episode of 25 steps is five rollouts long."""
-    setup = make_setup(load_config("lane", num_envs=10, rollout_length=5, episode_starts="spread"))
-    state = learner.init(setup, setup.hyper, jax.random.key(0))
+    small = {"method": "mappo", "epochs": 1, "minibatches": 1}
+    setup = make_setup(load_config("lane", num_envs=10, rollout_length=5, episode_starts="spread", **small))
+    state = jax.jit(lambda key: learner.init(setup, setup.hyper, key))(jax.random.key(0))
     step = jax.jit(lambda state: learner.train_step(setup, setup.hyper, state))
     begun, counted, lengths = [], [], []
     for _ in range(10):
