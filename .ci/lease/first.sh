@@ -9,5 +9,5 @@ stamped() { # prints when each line was said, seconds after the start
 }
 stamped > /tmp/runs/start_cold.txt
 stamped > /tmp/runs/start_warm.txt
-env -u CUDA_MPS_PIPE_DIRECTORY bash -c "$(declare -f stamped); cores=$cores stamped" > /tmp/runs/start_alone.txt
+(unset CUDA_MPS_PIPE_DIRECTORY && stamped) > /tmp/runs/start_alone.txt
 rm -f /tmp/runs/quiet-0

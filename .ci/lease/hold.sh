@@ -13,4 +13,3 @@ for run in $(cd /tmp && ls -d runs/runs/velocity/*-{happo,f4sg} 2> /dev/null); d
     tar cf - -C /tmp "$run/checkpoints" "$run/config.toml" | xz -T8 -3 > "$OUT/$name.tar.xz"
   fi
 done
-true

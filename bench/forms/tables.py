@@ -452,14 +452,8 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         ("peer",),
         (
             *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
-            *(
-                "environment steps/s",
-                "of pmt train, MAPPO-L",
-                "turns' reward",
-                "turns' cost",
-                "first update, s",
-                "other work, CPUs",
-            ),
+            *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost"),
+            *("first update, s", "other work, CPUs"),
         ),
     ),
 }

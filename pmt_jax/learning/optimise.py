@@ -61,6 +61,7 @@ def fit(
     shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
     def step(net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
+        # Said in the scan: what is said before it does not reach all rows, and devices then exchange some at each step.
         minibatch = sharding.shard(jax.tree.map(lambda x: x[index], sharding.replicate(rows)))
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
         norm = optax.tree.norm(gradient)
