@@ -15,4 +15,4 @@ for turn in 1 2 3; do
   phases 64 2
   phases 8 1
 done
-timeout 120 python3 -m bench measure workstation --threads 8 --only "plain" --out /tmp/runs/plain_8.json | tail -1
+timeout 240 python3 -m bench measure workstation --threads 8 --only "plain" --out /tmp/runs/plain_8.json | tail -1
