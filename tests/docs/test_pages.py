@@ -43,7 +43,7 @@ STATED: dict[str, dict[str, str]] = {
     "results/limits.md": {
         "limits and margins": "10",
         "seeds": "3 420 439 440 459 460 479",
-        "means of limits_relative_h200.json and of both runs of Table 1, and a quotient": "0.13 5,070 5,001 3,308 4,669 0.87",
+        "means of limits_relative_h200.json and of Table 1, and a quotient": "0.13 5,070 5,001 3,308 4,669 0.87",
         "multipliers in the stored runs": "6 7 12 53",
         "a setting, and a commit": "0.03 8775164",
         "rates": "204,000 217,000",
