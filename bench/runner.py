@@ -71,6 +71,7 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
     if name == "grid":
         grid.prepare()
+    from pmt_jax.training import processes
     from pmt_jax.training.run_folder import MATMUL_PRECISION
 
     from . import measure as measuring
@@ -79,8 +80,7 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
     shared = min(usable_cpus(), max((case.devices for case in cases), default=1))
     if bench.on == "cpu" and shared > 1:  # before JAX starts
-        # Fewer than processes.make_room has: rows of one device share this process, and train with a thread a core.
-        os.environ.setdefault("NPROC", str(max(usable_cpus(), 2 * shared)))
+        os.environ.setdefault("NPROC", str(processes.threads_for(shared)))
         jax.config.update("jax_num_cpu_devices", shared)
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)

@@ -15,7 +15,7 @@ from typing import Any
 
 DEVICES = int(sys.argv[1])
 if DEVICES > 1:
-    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={DEVICES}"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
 
 import jax  # noqa: E402
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import socket
 import zlib
 from collections.abc import Callable, Sequence
@@ -55,15 +56,24 @@ def join(coordinator: str | None, process: int | None, processes: int | None) ->
 
 
 def make_room(several: bool = False) -> None:
-    """Sets more threads than cores for XLA's CPU devices, if they are several or in `several` processes.
+    """Gives XLA's CPU devices enough threads, if they are several or in `several` processes.
 
-    A collective holds a thread of the pool until all devices have reached it, and devices reach theirs in any order:
-    with no more threads than devices they may deadlock, and XLA ends the process after 40 s. It must be called before
-    JAX is asked for devices.
+    It must be called before JAX is asked for devices.
     """
-    made = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    made = re.search(r"xla_force_host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
     if made or (several and getattr(jax.config, "jax_platforms", None) == "cpu"):
-        os.environ.setdefault("NPROC", "64")  # the size of XLA's pool
+        os.environ.setdefault("NPROC", str(threads_for(int(made[1]) if made else 1)))
+
+
+def threads_for(devices: int) -> int:
+    """The size of XLA's pool for so many CPU devices of this process, which its variable NPROC sets.
+
+    A collective holds a thread of each device until all devices have reached it, and devices reach theirs in any order:
+    with no more threads than devices they may deadlock, and XLA ends the process after 40 s. Many more cost time: 64
+    for two devices on two cores cost a sixth of an update.
+    """
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(cpus, 2 * devices)
 
 
 def in_step() -> bool:
