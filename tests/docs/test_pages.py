@@ -26,7 +26,6 @@ STATED: dict[str, dict[str, str]] = {
     "howto/compare.md": {"level of intervals": "95"},
     "howto/evaluate.md": {"level of intervals": "95"},
     "howto/export.md": {"bits": "32"},
-    "howto/hosts.md": {"threads, a constant of XLA": "64"},
     "howto/pretrained.md": {"level of intervals": "95"},
     "howto/render.md": {"name of a feeder": "33"},
     "howto/resume.md": {"a constant of the code": "1e8"},
