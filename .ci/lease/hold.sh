@@ -2,7 +2,6 @@
 until [ $(($(date +%s) - $(cat /tmp/repo/.ci/lease/asked))) -ge "$1" ] || [ -e /tmp/runs/ended ]; do sleep 2; done
 cat /tmp/runs/queue.out
 for log in /tmp/runs/logs/*; do echo "$(basename "$log"): $(tail -c 200 "$log" | tr '\r' '\n' | tail -1)"; done
-for file in /tmp/runs/first.out /tmp/runs/start_*.txt; do echo "$file" && head -n 12 "$file" && tail -n 3 "$file"; done 2> /dev/null | cut -c 1-200
 tail -n 25 /tmp/runs/cpu.out | cut -c 1-300
 nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
 cd /tmp && tar cf - --exclude=checkpoints runs | xz -T8 -3 > "$OUT/runs.tar.xz"

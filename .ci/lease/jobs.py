@@ -37,9 +37,6 @@ VELOCITY = {
     for name, method in METHODS.items()
 }
 
-# Table 1 by one command on all GPUs, timed. With one program a GPU nothing runs beside it.
-TABLE1 = {"all/table1": "-m pmt_jax reproduce table1 --budget=paper --jobs=14 --no-cache"}
-
 # Programs at a time on a GPU, and the runs. Two programs of 20 ants' seeds made 295,000 steps/s on an H100.
-# The next lease: 3, SPREAD | VELOCITY, of which as much as fits.
-PROGRAMS, JOBS = 1, TABLE1 | GRIDS
+# After these: 1, CELLS | OTHER_ANT.
+PROGRAMS, JOBS = 2, GRIDS | SPREAD | VELOCITY

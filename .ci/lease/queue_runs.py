@@ -17,7 +17,7 @@ OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
 GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
-Running = tuple[tuple[int, ...], str, subprocess.Popen[bytes]]
+Running = tuple[int, str, subprocess.Popen[bytes]]
 ENVIRONMENT = {  # beside what setup.sh exports
     "PYTHONUNBUFFERED": "1",
     "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
@@ -30,43 +30,38 @@ def log(*words: object) -> None:
     print(f"{time.time() - BEGIN:.0f} s", *words, flush=True)
 
 
-def start(gpus: tuple[int, ...], name: str, command: list[str]) -> subprocess.Popen[bytes]:
+def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
     begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
     if begun.exists():
         command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
     command = [*command, "--out", str(begun.parent)]
-    if SMOKE and "reproduce" in command:
-        command = [word.replace("=paper", "=smoke") for word in command]
-    elif SMOKE:
+    if SMOKE:
         tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
         command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
-    log("GPU", *gpus, "starts", name)
+    log("GPU", gpu, "starts", name)
     with open(OUT / "logs" / name.replace("/", "-"), "w") as file:
-        where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))}
+        where = {} if SMOKE else ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": str(gpu)}
         return subprocess.Popen(
             [sys.executable, *command], env=os.environ | where, stdout=file, stderr=subprocess.STDOUT
         )
 
 
-def room(running: list[Running], name: str) -> tuple[int, ...]:
-    """The GPUs for the next run: the one with the fewest programs; () if none has room. `all/` needs all, empty."""
-    at = [sum(gpu in gpus for gpus, _, _ in running) for gpu in range(GPUS)]
-    at = [jobs.PROGRAMS if (OUT / f"quiet-{gpu}").exists() else count for gpu, count in enumerate(at)]  # see first.sh
-    if name.startswith("all/"):
-        return () if any(at) else tuple(range(GPUS))
-    return (at.index(min(at)),) if min(at) < jobs.PROGRAMS else ()
+def room(running: list[Running]) -> int | None:
+    """The GPU for the next run, which has the fewest programs; None if no GPU has room."""
+    at = [sum(gpu == there for there, _, _ in running) for gpu in range(GPUS)]
+    return at.index(min(at)) if min(at) < jobs.PROGRAMS else None
 
 
 def main() -> None:
     queue, running = list(jobs.JOBS.items()), list[Running]()
     while time.time() - BEGIN < END and (queue or running):
-        for gpus, name, process in list(running):
+        for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
-                running.remove((gpus, name, process))
-        if queue and (free := room(running, queue[0][0])):
+                running.remove((gpu, name, process))
+        if queue and (free := room(running)) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
         else:
