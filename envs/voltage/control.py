@@ -260,10 +260,13 @@ class VoltageControl:
             return self._solve_first(start_row, q, row, next_key)
 
         def unsolved(c: tuple[jax.Array, Carry]) -> jax.Array:
-            return (c[0] < MAX_RESETS) & ~jnp.isfinite(c[1].line_loss_mw)
+            return (c[0] <= MAX_RESETS) & ~jnp.isfinite(c[1].line_loss_mw)
 
         zero = jnp.zeros((), jnp.int32)
-        _, carry = jax.lax.while_loop(unsolved, lambda c: (c[0] + 1, draw(c[0] + 1)), (zero, draw(zero)))
+        nothing = jax.tree.map(lambda x: jax.lax.full(x.shape, 0, x.dtype), jax.eval_shape(draw, zero))
+        nothing = dataclasses.replace(nothing, line_loss_mw=jnp.full_like(nothing.line_loss_mw, jnp.nan))
+        # The first draw is made in the loop, too: a draw has a power flow, which XLA then compiles once.
+        _, carry = jax.lax.while_loop(unsolved, lambda c: (c[0] + 1, draw(c[0])), (zero, nothing))
         return self._observe(carry)
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -131,7 +131,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
     placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys))
     everywhere = sharding.replicated(setup.mesh)
-    state = jax.jit(init, out_shardings=placement)(hyper, keys)
+    state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(_options(once=True))(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
         state, metrics = learner.train_chunk(setup, hyper, state, config.log_interval)
@@ -152,14 +152,17 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     return state, programs, found
 
 
-def _options() -> dict[str, str | bool] | None:
-    """XLA's options for a run's programs.
+def _options(once: bool = False) -> dict[str, str | bool] | None:
+    """XLA's options for a run's programs, and for what runs `once`. Whoever sets a level in XLA_FLAGS gets that.
 
     On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
-    training was no faster for it (docs/results/speed.md). Whoever sets a level in XLA_FLAGS gets that.
+    training was no faster for it (docs/results/speed.md). On a CPU it would optimise the code that draws the first
+    weights and states for longer than that code runs. With less of it the numbers are the same to the last bit.
     """
-    chosen = "xla_gpu_autotune_level" in os.environ.get("XLA_FLAGS", "")
-    return None if chosen or jax.default_backend() != "gpu" else {"xla_gpu_autotune_level": "0"}
+    on_gpu = jax.default_backend() == "gpu"
+    option, level = ("xla_gpu_autotune_level", "0") if on_gpu else ("xla_backend_optimization_level", "1")
+    chosen = option in os.environ.get("XLA_FLAGS", "")
+    return {option: level} if (on_gpu or once) and not chosen else None
 
 
 def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
