@@ -157,8 +157,8 @@ def _options(once: bool = False) -> dict[str, str | bool] | None:
 
     On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
     training was no faster for it (docs/results/speed.md). On a CPU it would optimise the code that draws the first
-    weights and states for longer than that code runs. With less of it the
-    weights are the same to the last bit, and voltages of a grid to 1e-7.
+    weights and states for longer than that code runs. With less of it the weights are the same to the last bit, and the
+    voltages of a grid to 1e-7.
     """
     on_gpu = jax.default_backend() == "gpu"
     option, level = ("xla_gpu_autotune_level", "0") if on_gpu else ("xla_backend_optimization_level", "1")
