@@ -15,7 +15,7 @@ import pytest
 
 from places import ROOT
 from pmt_jax.policies import load
-from pmt_jax.training import checkpoint
+from pmt_jax.training import checkpoint, processes
 
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
 ARGUMENTS = ("train", "lane", "--num-envs", 4, *TINY, "--eval-interval", 2, "--eval-episodes", 2, "--seeds", 1)
@@ -88,6 +88,11 @@ def test_seeds_and_environments_split_change_nothing_but_rounding():
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
     assert not [line for line in found["collectives"] if '/gather"' in line]  # nor to find the rows of a minibatch
+
+
+@pytest.mark.parametrize("devices", [1, 2, 8, 64])
+def test_waiting_devices_leave_threads_to_the_others(devices: int):
+    assert processes.threads_for(devices) > devices
 
 
 @pytest.mark.full

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -117,6 +118,24 @@ def test_reset_is_within_the_data_and_differs_by_key() -> None:
     share = np.asarray(states.carry.q) / limit
     assert share.min() < -0.95 and share.max() > 0.95 and np.abs(share).max() <= 1 + 1e-6
     assert not states.terminated.any() and not states.cost.any() and not states.reward.any()
+
+
+def test_a_date_without_solution_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = jax.random.split(jax.random.key(0), 16)
+    env = folder_env()
+    before = jax.jit(jax.vmap(env.reset))(keys).carry
+    solve = env._solve_first
+
+    def of_odd_rows(row: jax.Array, *rest: jax.Array):
+        carry = solve(row, *rest)
+        return dataclasses.replace(carry, line_loss_mw=jnp.where(row % 2 == 1, carry.line_loss_mw, jnp.nan))
+
+    monkeypatch.setattr(env, "_solve_first", of_odd_rows)
+    after = jax.jit(jax.vmap(env.reset))(keys).carry
+    odd = np.asarray(before.start_row) % 2 == 1
+    assert 0 < odd.sum() < 16 and (after.start_row % 2 == 1).all() and np.isfinite(after.line_loss_mw).all()
+    np.testing.assert_array_equal(after.start_row[odd], before.start_row[odd])
+    np.testing.assert_array_equal(after.q[odd], before.q[odd])
 
 
 def test_state_structure_never_changes() -> None:
