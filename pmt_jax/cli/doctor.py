@@ -98,13 +98,14 @@ def examine() -> Iterator[Finding]:
 def _devices() -> Finding:
     import jax
 
+    from ..training.processes import usable_cpus
+
     try:
         devices = jax.devices()
     except RuntimeError as error:
         return Finding("bad", "devices", f"JAX finds none: {str(error).splitlines()[0]}")
     kinds = ", ".join(f"{d.device_kind} ({d.platform})" for d in devices)
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Finding("ok", "devices", f"{kinds}; {cpus} CPUs usable")
+    return Finding("ok", "devices", f"{kinds}; {usable_cpus()} CPUs usable")
 
 
 def _engines() -> Iterator[Finding]:

@@ -160,10 +160,14 @@ def _options(once: bool = False) -> dict[str, str | bool] | None:
     weights and states for longer than that code runs. With less of it the weights are the same to the last bit, and the
     voltages of a grid to 1e-7.
     """
-    on_gpu = jax.default_backend() == "gpu"
-    option, level = ("xla_gpu_autotune_level", "0") if on_gpu else ("xla_backend_optimization_level", "1")
-    chosen = option in os.environ.get("XLA_FLAGS", "")
-    return {option: level} if (on_gpu or once) and not chosen else None
+    backend = jax.default_backend()
+    if backend == "gpu":
+        option, level = "xla_gpu_autotune_level", "0"
+    elif backend == "cpu" and once:
+        option, level = "xla_backend_optimization_level", "1"
+    else:
+        return None
+    return None if option in os.environ.get("XLA_FLAGS", "") else {option: level}
 
 
 def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:

@@ -72,8 +72,12 @@ def threads_for(devices: int) -> int:
     with no more threads than devices they may deadlock, and XLA ends the process after 40 s. Many more cost time: 64
     for two devices on two cores cost a sixth of an update.
     """
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(cpus, 2 * devices)
+    return max(usable_cpus(), 2 * devices)
+
+
+def usable_cpus() -> int:
+    """CPUs that this process may run on, without MuJoCo, which `pmt doctor` may find broken."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_step() -> bool:
