@@ -6,7 +6,7 @@ tail -n 25 /tmp/runs/cpu.out | cut -c 1-300
 nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
 cd /tmp && tar cf - --exclude=checkpoints runs | xz -T8 -3 > "$OUT/runs.tar.xz"
 # Policies apart and once: an archive that is too large stays there, and the metrics must not stay with it.
-for run in $(cd /tmp && ls -d runs/runs/velocity/*-{happo,f4sg} 2> /dev/null); do
+for run in $(cd /tmp && ls -d runs/runs/velocity/*-{happo,mappo_l,f4sg} 2> /dev/null); do
   name=$(basename "$run")
   if grep -q '^done:' "/tmp/runs/logs/velocity-$name" && mkdir "/tmp/sent-$name" 2> /dev/null; then
     tar cf - -C /tmp "$run/checkpoints" "$run/config.toml" | xz -T8 -3 > "$OUT/$name.tar.xz"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from .. import tasks
 from ..config.settings import Config, Hyper
 from ..errors import UsageError
-from . import emotions, rollout
+from . import emotions, rollout, sharding
 from .debug import check_finite, watched
 from .maths import lagrangian, running_moments
 from .maths.advantages import gae
@@ -112,20 +112,22 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     advantage, returns = gae(batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
-    # 4 Critics.
-    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
-    fit_critic = functools.partial(_fit_critic, setup, hyper)
-    critic, critic_metrics = fit_critic(state.critic, setup.nets.value, rows, tagged[Tag.CRITIC])
-    cost_critic, cost_critic_metrics = fit_critic(
-        state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]
-    )
-
-    # 5 Coping response: every agent's policy, and its multipliers.
+    # 4 Critics, and 5 coping response: every agent's policy, and its multipliers.
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
     cost_excess = _cost_excess(setup, hyper, episode_cost)
     weigh = functools.partial(_weight_of_cost, setup, hyper, state, cost_excess)
-    rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
-    actor, multiplier, actor_metrics = update_policies(setup, hyper, state, rows, cost_excess, tagged)
+    policies = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
+    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    fit_value = functools.partial(_fit_critic, setup, setup.nets.value)
+    fit_cost_value = functools.partial(_fit_critic, setup, setup.nets.cost_value)
+    update = functools.partial(update_policies, setup)
+    (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, multiplier, actor_metrics) = (
+        sharding.side_by_side(
+            (fit_value, (hyper, state.critic, rows, tagged[Tag.CRITIC])),
+            (fit_cost_value, (hyper, state.cost_critic, cost_rows, tagged[Tag.COST_CRITIC])),
+            (update, (hyper, state.actor, state.multiplier, policies, cost_excess, tagged)),
+        )
+    )
 
     computed = {"batch": batch, "fear": fear, "cost_signal": cost_signal, "regret": regret, "log_weight": log_weight}
     computed |= {"advantage": advantage, "returns": returns, "cost_advantage": cost_advantage}
@@ -219,9 +221,9 @@ def _values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array,
 
 def _fit_critic(
     setup: Setup,
+    value_fn: ValueFn,
     hyper: Hyper,
     critic: Critic,
-    value_fn: ValueFn,
     rows: tuple[jax.Array, jax.Array, jax.Array],
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:

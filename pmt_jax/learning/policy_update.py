@@ -15,13 +15,14 @@ from .maths.advantages import standardise
 from .maths.losses import clipped_surrogate, hybrid_advantage
 from .optimise import fit, shuffled
 from .setup import Setup
-from .types import Batch, Hyper, LearnerState, Metrics, Params, PolicyRows, Tag, TrainState
+from .types import Batch, Hyper, Metrics, Params, PolicyRows, Tag, TrainState
 
 
 def update_policies(
     setup: Setup,
     hyper: Hyper,
-    state: LearnerState,
+    actor: TrainState,
+    multiplier: jax.Array,
     rows: PolicyRows,
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
@@ -35,7 +36,7 @@ def update_policies(
       actors, multipliers [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
     """
     update = {"sequential": _sequential, "simultaneous": _simultaneous}[setup.method.order]
-    actor, multiplier, metrics = update(setup, hyper, state, rows, cost_excess, tagged)
+    actor, multiplier, metrics = update(setup, hyper, actor, multiplier, rows, cost_excess, tagged)
     kl = metrics.pop("kl_per_agent")
     return actor, multiplier, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
 
@@ -81,7 +82,8 @@ def policy_rows(
 def _sequential(
     setup: Setup,
     hyper: Hyper,
-    state: LearnerState,
+    actor: TrainState,
+    multiplier: jax.Array,
     rows: PolicyRows,
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
@@ -103,7 +105,7 @@ def _sequential(
         return (actor, multiplier.at[i].set(updated), factor * jnp.exp(log_ratio)), metrics
 
     order = jax.random.permutation(tagged[Tag.ORDER], setup.nets.num_agents)
-    start = (state.actor, state.multiplier, jnp.ones_like(rows.factor[0]))
+    start = (actor, multiplier, jnp.ones_like(rows.factor[0]))
     (actor, multiplier, _), metrics = jax.lax.scan(one_agent, start, order)
     metrics["kl_per_agent"] = metrics["kl_per_agent"][jnp.argsort(order)]
     return actor, multiplier, metrics
@@ -112,7 +114,8 @@ def _sequential(
 def _simultaneous(
     setup: Setup,
     hyper: Hyper,
-    state: LearnerState,
+    actor: TrainState,
+    multiplier: jax.Array,
     rows: PolicyRows,
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
@@ -121,9 +124,9 @@ def _simultaneous(
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
     per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), rows)
-    cost_excesses = (cost_excess + state.multiplier).reshape(actors, -1, cost_excess.shape[-1]).mean(1)
+    cost_excesses = (cost_excess + multiplier).reshape(actors, -1, cost_excess.shape[-1]).mean(1)
     one = jax.vmap(lambda *each: update_policy(setup, hyper, *each))
-    actor, metrics = one(state.actor, per_actor, cost_excesses, keys)
+    actor, metrics = one(actor, per_actor, cost_excesses, keys)
 
     def of_all(x: jax.Array) -> jax.Array:
         return jnp.broadcast_to(x, (setup.nets.num_agents, *x.shape[1:]))
@@ -131,7 +134,7 @@ def _simultaneous(
     params = jax.tree.map(of_all, actor.params)
     log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: _policy_change(setup, *each))(params, rows)
     updated = jax.vmap(lambda *each: _update_multiplier(setup, hyper, *each))(
-        state.multiplier, rows, cost_excess, log_ratio, jax.tree.map(of_all, metrics)
+        multiplier, rows, cost_excess, log_ratio, jax.tree.map(of_all, metrics)
     )
     return actor, updated, metrics
 

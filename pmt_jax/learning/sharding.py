@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -124,5 +126,32 @@ def replicate(tree: Any) -> Any:
     return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P())
 
 
+def side_by_side(*parts: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, ...]:
+    """What each function returns for its arguments; none needs another's result.
+
+    The devices of a CPU take whole functions, the first device the first ones: gradients of small minibatches are
+    computed faster than exchanged between its cores. Other devices share the rows of every function (`shard`).
+    """
+    if _single_device() or jax.default_backend() != "cpu":
+        return tuple(function(*arguments) for function, arguments in parts)
+    devices = jax.sharding.get_abstract_mesh().shape[ENV]
+
+    def taken_by(device: int, *arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        results = []
+        for i, (function, _) in enumerate(parts):
+            result = functools.partial(function, *arguments[i])
+            mine = i * min(devices, len(parts)) // len(parts) == device
+            results.append(result() if mine else jax.tree.map(jnp.zeros_like, jax.eval_shape(result)))
+        return tuple(results)
+
+    def of_device(*arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        branches = [functools.partial(taken_by, device) for device in range(devices)]
+        return jax.lax.psum(jax.lax.switch(jax.lax.axis_index(ENV), branches, *arguments), ENV)
+
+    return jax.shard_map(of_device, in_specs=P(), out_specs=P(), check_vma=False)(*(x for _, x in parts))
+
+
 def _single_device() -> bool:
-    return jax.sharding.get_abstract_mesh().empty
+    """Whether there is no mesh, or what is traced is one device's own."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return mesh.empty or ENV in mesh.manual_axes

@@ -160,7 +160,9 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
         setup, hyper, state.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
     cost_excess = jnp.asarray([[0.5], [0.25]])
-    actor, multiplier, _ = policy_update._sequential(setup, hyper, state, rows, cost_excess, tagged)
+    actor, multiplier, _ = policy_update._sequential(
+        setup, hyper, state.actor, state.multiplier, rows, cost_excess, tagged
+    )
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)
