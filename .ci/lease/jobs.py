@@ -27,8 +27,8 @@ CELLS = {f"limits/{method}": f"{ANT} --method={method} {MULTIPLIER}" for method 
 MACPO = "--method=macpo --limit-lr=0.1 --kl-limit=0.03 --seed=440 --seeds=20 --cost-limit=10 --cost-margin=0.5"
 OTHER_ANT = {"limits/macpo_4x2": f"-m pmt_jax train paper/ant_4x2 {MACPO}"}
 
-# The velocity tasks' table: a lease holds two of the tasks with SafePO's results, or the four light robots, or the humanoid.
-# Those that take longest come first.
+# The velocity tasks' table: a lease holds two of the tasks with SafePO's results, or the light robots, or the humanoid.
+# What takes longest comes first.
 METHODS = {"macpo": "macpo", "r4sg": "r4sg", "mixed": "mixed", "f4sg": "f4sg", "mappo_l": "mappo_l", "happo": "happo"}
 METHODS |= {"pid": "mappo_l --lambda-rule=pid --lambda-kp=0.5", "mappo": "mappo"}
 VELOCITY = {
@@ -37,5 +37,5 @@ VELOCITY = {
     for name, method in METHODS.items()
 }
 
-# Programs at a time on a GPU, and the runs. After these: VELOCITY with the other tasks, GRIDS | OTHER_ANT | SPREAD, CELLS.
+# Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, GRIDS | OTHER_ANT | SPREAD, CELLS.
 PROGRAMS, JOBS = 12, VELOCITY
