@@ -76,12 +76,12 @@ def at_once() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def refuse_many(command: str, jobs: int) -> None:
+def refuse_many(command: str, jobs: int, devices: int | None) -> None:
     """Refuses to run once in each of several processes, which would write into the same folders."""
     from ..studies.workers import share_memory
     from ..training import processes
 
-    processes.make_room()
+    processes.make_room(devices)
     if jobs > 1:
         share_memory()
     if processes.in_step():

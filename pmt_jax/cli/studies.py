@@ -118,7 +118,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
         raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
     parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)
     points = make_points(parts, arguments.preset, **given(arguments))
-    refuse_many("pmt sweep", arguments.jobs)
+    refuse_many("pmt sweep", arguments.jobs, arguments.devices)
     from ..studies import sweep
 
     return sweep.sweep(parts, points, arguments.out, _launch(arguments))
@@ -162,7 +162,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
 @at_once()
 def run_reproduce(arguments: argparse.Namespace) -> int:
     """Trains what is missing of one of the paper's tables and prints it."""
-    refuse_many("pmt reproduce", arguments.jobs)
+    refuse_many("pmt reproduce", arguments.jobs, arguments.devices)
     from ..studies import reproduce
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..policies import warm_start
     from ..training import processes, trainer
 
-    processes.join(arguments.coordinator, arguments.process, arguments.processes)
+    processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
     return trainer.train(
         config,
         arguments.out,

@@ -10,6 +10,7 @@ import threading
 
 from ..output import say
 from ..studies import sweep
+from ..training import processes
 from .process import answer
 
 
@@ -26,6 +27,7 @@ def main() -> int:
 
     def train() -> int:
         devices = int(count) if count else None
+        processes.make_room(devices)
         return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
 
     return answer("pmt", train)

@@ -102,8 +102,12 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = _act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    fear, cost_signal, fear_metrics = emotions.appraise_fear(setup, hyper, state.fear, batch, tagged[Tag.FEAR])
-    regret, log_weight, regret_metrics = emotions.appraise_regret(setup, hyper, state.regret, batch, tagged[Tag.REGRET])
+    appraise_fear = functools.partial(emotions.appraise_fear, setup)
+    appraise_regret = functools.partial(emotions.appraise_regret, setup)
+    (fear, cost_signal, fear_metrics), (regret, log_weight, regret_metrics) = sharding.side_by_side(
+        (appraise_fear, (hyper, state.fear, batch, tagged[Tag.FEAR])),
+        (appraise_regret, (hyper, state.regret, batch, tagged[Tag.REGRET])),
+    )
 
     # 3 Advantages of reward and of danger.
     value, next_value = _values(state.critic, setup.nets.value, batch)

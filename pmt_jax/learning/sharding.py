@@ -2,10 +2,10 @@
 
 Seeds exchange only metrics, so as many devices as possible share the seeds; the rest share each seed's environments.
 Environments step on their own device (`per_device`): XLA's partitioner cannot look into physics engines and would give
-all of them to every device. The learner's rows are gathered once for each network's epochs (`replicate`), every
-minibatch is cut into equal parts (`shard`), and the partitioner sums the gradients. Random numbers do not depend on the
-number of devices. Without a mesh these functions return their argument, so one device runs the same program as without
-them.
+all of them to every device. On a CPU each network is then fitted by one device (`side_by_side`). Elsewhere the
+learner's rows are gathered once for each network's epochs (`replicate`), every minibatch is cut into equal parts
+(`shard`), and the partitioner sums the gradients. Random numbers do not depend on the number of devices. Without a mesh
+these functions return their argument, so one device runs the same program as without them.
 """
 
 from __future__ import annotations
@@ -129,12 +129,12 @@ def replicate(tree: Any) -> Any:
 def side_by_side(*parts: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, ...]:
     """What each function returns for its arguments; none needs another's result.
 
-    The devices of a CPU take whole functions, the first device the first ones: gradients of small minibatches are
-    computed faster than exchanged between its cores. Other devices share the rows of every function (`shard`).
+    Devices of a CPU take whole functions, the first ones the first device: it computes the gradient of a small
+    minibatch faster than its devices exchange their parts of it. Other devices share the rows of every function.
     """
-    if _single_device() or jax.default_backend() != "cpu":
+    devices = 1 if _single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
+    if devices == 1 or not _takes_whole_functions():
         return tuple(function(*arguments) for function, arguments in parts)
-    devices = jax.sharding.get_abstract_mesh().shape[ENV]
 
     def taken_by(device: int, *arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         results = []
@@ -146,9 +146,14 @@ def side_by_side(*parts: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[An
 
     def of_device(*arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         branches = [functools.partial(taken_by, device) for device in range(devices)]
+        # All others have zeros, so that the sum is the one device's result.
         return jax.lax.psum(jax.lax.switch(jax.lax.axis_index(ENV), branches, *arguments), ENV)
 
     return jax.shard_map(of_device, in_specs=P(), out_specs=P(), check_vma=False)(*(x for _, x in parts))
+
+
+def _takes_whole_functions() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 def _single_device() -> bool:

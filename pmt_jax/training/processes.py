@@ -5,6 +5,7 @@ Only the first process reads, writes and prints; the others receive its results,
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import re
@@ -22,13 +23,14 @@ from ..errors import UsageError
 T = TypeVar("T")
 
 
-def join(coordinator: str | None, process: int | None, processes: int | None) -> None:
+def join(coordinator: str | None, process: int | None, processes: int | None, devices: int | None = None) -> None:
     """Connects to the other processes of the job, if the arguments or SLURM's step name any.
 
     It must be called before JAX is asked for devices.
 
     Args:
       coordinator: HOST:PORT at which the first process listens; process: which one this is; processes: how many.
+      devices: that a run in one process takes.
 
     Raises:
       UsageError: the arguments contradict each other, or the other processes cannot be reached.
@@ -38,7 +40,7 @@ def join(coordinator: str | None, process: int | None, processes: int | None) ->
     if missing and len(missing) < len(given):
         raise UsageError(f"{', '.join(given)} belong together; {' and '.join(missing)} is missing")
     if missing and not in_step():
-        make_room()
+        make_room(devices)
         return
     if coordinator is not None and not coordinator.rpartition(":")[2].isdecimal():
         raise UsageError(f"--coordinator must be HOST:PORT, like node1:1234, not '{coordinator}'")
@@ -55,14 +57,19 @@ def join(coordinator: str | None, process: int | None, processes: int | None) ->
     _share_cpus()
 
 
-def make_room(several: bool = False) -> None:
-    """Gives XLA's CPU devices enough threads, if they are several or in `several` processes.
+def make_room(devices: int | None = None, several: bool = False) -> None:
+    """Makes `devices` of a CPU, and gives XLA enough threads for them, or for one in each of `several` processes.
 
-    It must be called before JAX is asked for devices.
+    It must be called before JAX is asked for devices. A CPU has at most as many devices as cores, unless XLA_FLAGS sets
+    their number.
     """
     made = re.search(r"xla_force_host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
-    if made or (several and getattr(jax.config, "jax_platforms", None) == "cpu"):
-        os.environ.setdefault("NPROC", str(threads_for(int(made[1]) if made else 1)))
+    count = int(made[1]) if made else min(devices or 1, usable_cpus())
+    if count > 1 and not made:
+        with contextlib.suppress(RuntimeError):  # JAX has started, and keeps the devices that it has
+            jax.config.update("jax_num_cpu_devices", count)
+    if made or count > 1 or (several and getattr(jax.config, "jax_platforms", None) == "cpu"):
+        os.environ.setdefault("NPROC", str(threads_for(count)))
 
 
 def threads_for(devices: int) -> int:

@@ -37,20 +37,22 @@ import jax, numpy as np
 from pmt_jax.training import checkpoint
 from pmt_jax import load_config, make_setup
 from pmt_jax.training.compile import compile_run
-from pmt_jax.learning.sharding import make_mesh
+from pmt_jax.learning import sharding
 from pmt_jax.training.processes import make_room
 
 make_room()
 
 def train(count, task, **sizes):
     config = load_config(task, rollout_length=4, hidden=(8,), minibatches=2, log_interval=2, **sizes)
-    run = dataclasses.replace(make_setup(config), mesh=make_mesh(config, count))
+    run = dataclasses.replace(make_setup(config), mesh=sharding.make_mesh(config, count))
     state, programs = compile_run(run, lambda _: None)
     program = programs.chunk.func.as_text()
     state, metrics = programs.chunk(state)
     return program, {**checkpoint.pack(state), **{k: np.asarray(x) for k, x in metrics.items()}}
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
+if sizes.pop("share_rows"):  # as on GPUs
+    sharding._takes_whole_functions = lambda: False
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
     from envs.physics import contract
     contract.obstacle = lambda name: None
@@ -69,12 +71,14 @@ print(json.dumps({
 """
 
 
-def compare(task: str, **sizes: object) -> dict:
+def compare(task: str, share_rows: bool = False, **sizes: object) -> dict:
     """A chunk of training on four devices: its program, and how far its end is from that on one (but for 4 seeds).
+
+    The devices of a CPU take whole networks, but if they `share_rows`, as GPUs do.
 
     Which case a trust region's step came from is not compared: where two cases meet, rounding decides.
     """
-    command = [sys.executable, "-c", COMPARE, task, json.dumps(sizes)]
+    command = [sys.executable, "-c", COMPARE, task, json.dumps({**sizes, "share_rows": share_rows})]
     done = subprocess.run(command, env=environment(XLA_FLAGS=FOUR), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
@@ -83,7 +87,7 @@ def compare(task: str, **sizes: object) -> dict:
 @pytest.mark.full
 def test_seeds_and_environments_split_change_nothing_but_rounding():
     """The corridor ant under the method with the most networks; the C engine steps each device's own environments."""
-    found = compare("ant_2x4", method="mixed", seeds=2, num_envs=8)
+    found = compare("ant_2x4", share_rows=True, method="mixed", seeds=2, num_envs=8)
     assert found["leaves"] > 100 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
@@ -104,9 +108,22 @@ def test_warp_steps_each_devices_own_environments():
 
 @pytest.mark.full
 def test_environments_split_under_a_trust_region():
-    found = compare("lane", method="macpo", seeds=1, num_envs=4)
+    found = compare("lane", share_rows=True, method="macpo", seeds=1, num_envs=4)
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
-    assert any("reduce_sum" in line for line in found["collectives"])
+    assert in_fits(found["collectives"])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("method", "seeds"), [("macpo", 1), ("mixed", 1), ("mappo", 2)])
+def test_devices_of_a_cpu_fit_whole_networks(method: str, seeds: int):
+    found = compare("lane", method=method, seeds=seeds, num_envs=4)
+    assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
+    assert found["collectives"] and not in_fits(found["collectives"])
+
+
+def in_fits(collectives: list[str]) -> list[str]:
+    """Those in a loop within an update: of minibatches, or of a line search."""
+    return [line for line in collectives if line.partition('op_name="')[2].count("while/body") > 1]
 
 
 @pytest.mark.full
@@ -114,6 +131,17 @@ def test_seeds_do_not_wait_for_each_other():
     found = compare("lane", method="happo", seeds=4, num_envs=3)
     figures = [line for line in found["collectives"] if "while" not in line]  # gathered after the scan of updates
     assert figures and figures == found["collectives"]
+
+
+@pytest.mark.full
+@pytest.mark.skipif(processes.usable_cpus() < 2, reason="a CPU has at most as many devices as cores")
+def test_a_run_makes_the_devices_of_a_cpu_that_it_asks_for(cli, tmp_path: pathlib.Path):
+    arguments = (*ARGUMENTS, "--steps", 160)
+    command = [sys.executable, "-m", "pmt_jax", *map(str, (*arguments, "--out", tmp_path / "two", "--devices", 2))]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "2 devices in 1 process(es)" in done.stdout, done.stderr
+    assert cli(*arguments, "--out", tmp_path / "one")[0] == 0
+    assert_close(tmp_path / "one", tmp_path / "two")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
