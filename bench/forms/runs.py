@@ -118,7 +118,7 @@ def as_paper(file: pathlib.Path) -> str:
     several = len({row["cost_limit"] for row in found}) > 1
     body = []
     for row in found:
-        line = [row["method"] + (f", limit {row['cost_limit']:g}" if several else "")]
+        line = [_label(row) + (f", limit {row['cost_limit']:g}" if several else "")]
         line += [_mean_std(row[name]["mean"], row[name]["std"]) for name in measured]
         line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", f"{row['worst']:.2f}"]
         line += [_mean_std(*row["paper"][name]) if name in row["paper"] else "-" for name in published]
@@ -130,9 +130,9 @@ def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
     found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
     tasks = list(dict.fromkeys(row.task for row in found))
-    cells = {(x["method"], x["task"]): x for x in table.summarise(found)}
+    cells = {(_label(x), x["task"]): x for x in table.summarise(found)}
     body = []
-    for method in METHODS:
+    for method in dict.fromkeys(row.label for row in found):
         line = [cells[method, task] for task in tasks]
         words = [
             f"{x['reward']['mean']:,.4g} / {x['cost']['mean']:.3g}, {round(x['within'] * x['seeds'])} of {x['seeds']}"
@@ -178,18 +178,26 @@ def as_pairs(file: pathlib.Path) -> str:
             for j, other in enumerate(found)
             for of in ("reward" if i < j else "cost",)
         ]
-        body.append([f"`{row.method}`", *line])
-    return markdown(["", *(f"`{row.method}`" for row in found)], body)
+        body.append([f"`{row.label}`", *line])
+    return markdown(["", *(f"`{row.label}`" for row in found)], body)
 
 
-def _mean_std(mean: float, std: float) -> str:
-    digits = 2 if abs(mean) >= 1 else 4
-    return f"{mean:,.{digits}f} ± {std:,.{digits}f}"
+def _mean_std(*mean_and_std: float) -> str:
+    """As `mean ± std`; some report no standard deviation."""
+    digits = 2 if abs(mean_and_std[0]) >= 1 else 4
+    return " ± ".join(f"{x:,.{digits}f}" for x in mean_and_std)
 
 
 def _row(run: Run) -> Row:
+    """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
-    return Row(run["task"], run["method"], "", run["cost_limit"], max(run["steps"]), run["source"], scores)
+    settings = "pid" if tomllib.loads(run.get("config", "")).get("lambda_rule") == "pid" else ""
+    return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], scores)
+
+
+def _label(row: dict[str, Any]) -> str:
+    """`Row.label` of plain data."""
+    return " ".join(filter(None, (row["method"], row["settings"])))
 
 
 def as_points(file: pathlib.Path) -> str:
