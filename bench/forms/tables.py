@@ -81,6 +81,10 @@ def _of_plain_on_each_core(row: Row, rows: Rows) -> float | None:
     return rate(row) / (plain["threads"] * plain["steps_per_cpu_second"]) if plain and rate(row) else None
 
 
+def _of_as_many_loops(row: Row, rows: Rows) -> float | None:
+    return _over(row, rows, kind="plain loop")
+
+
 def _times_one_seed(row: Row, rows: Rows) -> float | None:
     same = {name: row.get(name) for name in ("kind", "task", "method", "physics", "num_envs", "rollout_length")}
     ratio = _over(row, rows, **same, seeds=1) if row.get("seeds", 1) > 1 else None
@@ -102,6 +106,8 @@ def _efficiency(row: Row, rows: Rows) -> float | None:
 
 
 def _update_seconds(row: Row, rows: Rows) -> float | None:
+    if row["kind"] == "plain loop":
+        return None
     return row["seeds"] * row["num_envs"] * row["rollout_length"] / row["steps_per_second"] if rate(row) else None
 
 
@@ -213,12 +219,14 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "worker processes": _shown("{}", "jobs"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
+    "of plain loops at once": _shown("{:.2f}", _of_as_many_loops),
     "the same per CPU-second": _shown("{:.2f}", _of_plain_per_cpu),
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
     "compile, s": _shown("{:.1f}", "compile_seconds"),
     "compile x MAPPO-L": _shown("{:.2f}", _compile_times_mappo_l),
     "update, s": _shown("{:.3f}", _update_seconds),
+    "rollout, s": _shown("{:.3f}", "rollout_seconds"),
     "update x MAPPO-L": _shown("{:.2f}", _times_mappo_l),
     "x one seed": _shown("{:.2f}", _times_one_seed),
     "efficiency": _shown("{:.2f}", _efficiency),
@@ -392,6 +400,11 @@ TABLES: dict[str, Callable[[Reports], str]] = {
             "steps per CPU-second",
             "of a plain loop on each core",
         ),
+    ),
+    "one_seed": Table(
+        "one_seed",
+        EVERY,
+        ("", SIZES, "devices", "environment steps/s", "of plain loops at once", "rollout, s", "update, s"),
     ),
     "velocity": Table("velocity", EVERY, ("task", *SPEED, CPU_SECONDS[0])),
     "methods": Table(
