@@ -14,4 +14,3 @@ python3 -m pmt_jax --help > /dev/null
 python3 -m bench list > /dev/null
 # `ended` also if the queue itself breaks: nobody should wait for it then.
 setsid bash -c "python3 .ci/lease/queue_runs.py; touch /tmp/runs/ended" > /tmp/runs/queue.out 2>&1 &
-[ ! -e .ci/lease/cpu.sh ] || setsid bash .ci/lease/cpu.sh > /tmp/runs/cpu.out 2>&1 &
