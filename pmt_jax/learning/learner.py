@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -102,11 +102,9 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = _act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    appraise_fear = functools.partial(emotions.appraise_fear, setup)
-    appraise_regret = functools.partial(emotions.appraise_regret, setup)
     (fear, cost_signal, fear_metrics), (regret, log_weight, regret_metrics) = sharding.side_by_side(
-        (appraise_fear, (hyper, state.fear, batch, tagged[Tag.FEAR])),
-        (appraise_regret, (hyper, state.regret, batch, tagged[Tag.REGRET])),
+        partial(emotions.appraise_fear, setup, hyper, state.fear, batch, tagged[Tag.FEAR]),
+        partial(emotions.appraise_regret, setup, hyper, state.regret, batch, tagged[Tag.REGRET]),
     )
 
     # 3 Advantages of reward and of danger.
@@ -119,19 +117,16 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     # 4 Critics, and 5 coping response: every agent's policy, and its multipliers.
     episode_cost = _episode_cost(setup, hyper, state, batch, cost_value)
     cost_excess = _cost_excess(setup, hyper, episode_cost)
-    weigh = functools.partial(_weight_of_cost, setup, hyper, state, cost_excess)
-    policies = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
+    weigh = partial(_weight_of_cost, setup, hyper, state, cost_excess)
+    actor_rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
-    fit_value = functools.partial(_fit_critic, setup, setup.nets.value)
-    fit_cost_value = functools.partial(_fit_critic, setup, setup.nets.cost_value)
-    update = functools.partial(update_policies, setup)
-    (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, multiplier, actor_metrics) = (
-        sharding.side_by_side(
-            (fit_value, (hyper, state.critic, rows, tagged[Tag.CRITIC])),
-            (fit_cost_value, (hyper, state.cost_critic, cost_rows, tagged[Tag.COST_CRITIC])),
-            (update, (hyper, state.actor, state.multiplier, policies, cost_excess, tagged)),
-        )
+    fit_critic = partial(_fit_critic, setup, hyper)
+    fitted = sharding.side_by_side(
+        partial(fit_critic, state.critic, setup.nets.value, rows, tagged[Tag.CRITIC]),
+        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]),
+        partial(update_policies, setup, hyper, state.actor, state.multiplier, actor_rows, cost_excess, tagged),
     )
+    (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, multiplier, actor_metrics) = fitted
 
     computed = {"batch": batch, "fear": fear, "cost_signal": cost_signal, "regret": regret, "log_weight": log_weight}
     computed |= {"advantage": advantage, "returns": returns, "cost_advantage": cost_advantage}
@@ -165,8 +160,8 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:
     """Collects a batch with the moments of observations frozen, then adds what was seen to the moments."""
     normalisers = (
-        functools.partial(setup.scale, state.obs_moments),
-        functools.partial(setup.scale, state.state_moments),
+        partial(setup.scale, state.obs_moments),
+        partial(setup.scale, state.state_moments),
     )
 
     def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
@@ -225,9 +220,9 @@ def _values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array,
 
 def _fit_critic(
     setup: Setup,
-    value_fn: ValueFn,
     hyper: Hyper,
     critic: Critic,
+    value_fn: ValueFn,
     rows: tuple[jax.Array, jax.Array, jax.Array],
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:

@@ -126,33 +126,37 @@ def replicate(tree: Any) -> Any:
     return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P())
 
 
-def side_by_side(*parts: tuple[Callable[..., Any], tuple[Any, ...]]) -> tuple[Any, ...]:
-    """What each function returns for its arguments; none needs another's result.
+def side_by_side(*parts: functools.partial[Any]) -> tuple[Any, ...]:
+    """What each of `parts` returns; none needs another's result.
 
-    Devices of a CPU take whole functions, the first ones the first device: it computes the gradient of a small
-    minibatch faster than its devices exchange their parts of it. Other devices share the rows of every function.
+    Devices of a CPU take whole parts, the first ones the first device: it computes the gradient of a small minibatch
+    faster than its devices exchange their shares of it. Other devices share the rows of every part.
     """
     devices = 1 if _single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
-    if devices == 1 or not _takes_whole_functions():
-        return tuple(function(*arguments) for function, arguments in parts)
+    if devices == 1 or not _takes_whole_parts():
+        return tuple(part() for part in parts)
+    leaves, structure = jax.tree.flatten([part.args for part in parts])
 
-    def taken_by(device: int, *arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-        results = []
-        for i, (function, _) in enumerate(parts):
-            result = functools.partial(function, *arguments[i])
+    def taken_by(device: int, *arrays: jax.Array) -> tuple[Any, ...]:
+        given, results = iter(arrays), []
+        arguments = jax.tree.unflatten(structure, [next(given) if isinstance(x, jax.Array) else x for x in leaves])
+        for i, part in enumerate(parts):
+            result = functools.partial(part.func, *arguments[i])
             mine = i * min(devices, len(parts)) // len(parts) == device
             results.append(result() if mine else jax.tree.map(jnp.zeros_like, jax.eval_shape(result)))
         return tuple(results)
 
-    def of_device(*arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    def of_device(*arrays: jax.Array) -> tuple[Any, ...]:
         branches = [functools.partial(taken_by, device) for device in range(devices)]
         # All others have zeros, so that the sum is the one device's result.
-        return jax.lax.psum(jax.lax.switch(jax.lax.axis_index(ENV), branches, *arguments), ENV)
+        return jax.lax.psum(jax.lax.switch(jax.lax.axis_index(ENV), branches, *arrays), ENV)
 
-    return jax.shard_map(of_device, in_specs=P(), out_specs=P(), check_vma=False)(*(x for _, x in parts))
+    # What a shard_map closes over would still belong to the whole mesh, so arrays go in as its arguments.
+    arrays = [x for x in leaves if isinstance(x, jax.Array)]
+    return jax.shard_map(of_device, in_specs=P(), out_specs=P(), check_vma=False)(*arrays)
 
 
-def _takes_whole_functions() -> bool:
+def _takes_whole_parts() -> bool:
     return jax.default_backend() == "cpu"
 
 
