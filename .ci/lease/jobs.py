@@ -5,14 +5,15 @@ from __future__ import annotations
 END = 1670.0  # seconds after asking
 
 # The study of limits, a trial first (docs/appendix/preregistration.md): episodes that begin evenly spread over the time
-# limit, on other seeds.
+# limit, with three rules of the multiplier, on other seeds.
 TRIAL = "-m pmt_jax sweep paper/ant_2x4 --method=mappo_l --seed=90 --seeds=5 --steps=8.4e6 --episode-starts=spread"
-TRIAL += " --set cost_limit=0.2,1 --set cost_std_floor=0.05,0.2 --cost-margin=0.5 --lambda-max=100"
-TRIAL += " --cost-estimate=average"
+TRIAL += " --set cost_limit=0.2,1 --cost-margin=0.5 --lambda-max=100 --cost-estimate=average"
 SPREAD = {
-    "limits/spread-relative": f"{TRIAL} --lambda-unit=relative --lambda-lr=0.005",
-    "limits/spread-equal": f"{TRIAL} --lambda-unit=limit --lambda-lr=0.02",
+    "limits/spread-relative": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=relative --lambda-lr=0.005",
+    "limits/spread-equal": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=limit --lambda-lr=0.02",
+    "limits/spread-pid": f"{TRIAL} --set lambda_kp=2,6 --lambda-rule=pid --lambda-unit=limit --lambda-lr=0.01",
 }
+
 # The cells (bench/sweeps/limits.toml), with the settings that the trial chooses: 40 trials a program, one on each GPU.
 MULTIPLIER = "--cost-estimate=average --lambda-unit=relative --lambda-lr=0.005 --lambda-max=100 --cost-std-floor=0.1"
 ANT = "-m pmt_jax sweep paper/ant_2x4 --set cost_limit=0.2,1 --seed=480 --seeds=20 --cost-margin=0.5"

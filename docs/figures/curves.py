@@ -29,6 +29,8 @@ FIGURES = {
     "table2": "table2_h200",
     "table3_voltage_33": "table3_voltage_33_h200",
     "table3_voltage_141": "table3_voltage_141_h200",
+    "velocity_ant_2x4": "velocity_ant_2x4_h200",
+    "velocity_half_cheetah_2x3": "velocity_half_cheetah_2x3_h200",
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
     "grid_33": "table3_voltage_33_h200",
@@ -63,17 +65,21 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
 
 
 def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[str, float]:
-    """Draws a method's mean over seeds, dotted to the `last` step if it stopped early; returns where it ends."""
+    """Draws a method's mean over seeds, dotted to the `last` step if it stopped early; returns its name and end.
+
+    A PID multiplier has dashes.
+    """
+    pid = "lambda_rule=pid" in group.settings
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))
     colour = plot.METHOD_COLOURS[group.method]
-    axis.plot(steps[known], mean, color=colour, lw=2)
+    axis.plot(steps[known], mean, color=colour, lw=2, ls="--" if pid else "-")
     if steps[known][-1] < 0.98 * last:
         axis.hlines(mean[-1], steps[known][-1], last, color=colour, lw=1, ls=":")
     if banded:
         axis.fill_between(steps[known], low, high, color=colour, alpha=0.18, lw=0)
-    return group.method, float(mean[-1])
+    return f"{group.method} pid" if pid else group.method, float(mean[-1])
 
 
 def main(names: list[str]) -> None:

@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 from bench.forms import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
-NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}
+NAMES = {"mappo": "MAPPO", "happo": "HAPPO", "mappo_l pid": "PID", **study.NAMES}
 DANGER = "#f6d5c3"  # a pale vermilion, where a step costs
 WALL = "#404040"
 GAP = 0.075  # of an axis' height, between two labels
@@ -22,7 +22,7 @@ def label_lines(axis: Any, ends: Sequence[tuple[str, float]]) -> None:
     """Writes each method's name to the right of `axis` at the height where its line ends, moved apart where they meet.
 
     Args:
-      ends: (method, y in data) pairs; the axis' limits and scale must be final.
+      ends: (name in NAMES, y in data) pairs; the axis' limits and scale must be final.
     """
     to_axis = axis.transData + axis.transAxes.inverted()
     heights = sorted((float(to_axis.transform((axis.get_xlim()[1], y))[1]), y, method) for method, y in ends)
@@ -34,7 +34,7 @@ def label_lines(axis: Any, ends: Sequence[tuple[str, float]]) -> None:
                 places[low : low + 2] += (-lack / 2, lack / 2)
         places = np.clip(places, 0.0, 1.0) if len(places) * GAP < 1 else places
     for place, (height, _, method) in zip(places, heights, strict=True):
-        colour = METHOD_COLOURS[method]
+        colour = METHOD_COLOURS[method.split()[0]]
         axis.plot([1.0, 1.04], [height, place], transform=axis.transAxes, color=colour, lw=0.8, clip_on=False)
         axis.text(1.05, place, NAMES[method], transform=axis.transAxes, color=colour, va="center", fontweight="bold")
 
