@@ -120,7 +120,7 @@ def add_devices(parser: Any) -> None:
         "--devices",
         type=whole(1),
         metavar="N",
-        help="split seeds and environments over N devices (default 1; in several processes all)",
+        help="split seeds and environments over N devices, or a CPU into N (default 1; in several processes all)",
     )
 
 
