@@ -11,9 +11,12 @@ Say = Callable[[str], None]
 
 
 def say(line: str) -> None:
-    """Prints a line at once, into a pipe too; drops it if standard output is closed."""
+    """Prints a line at once, into a pipe too; drops it if standard output is closed.
+
+    Line and newline are one write: threads that repeat what worker processes say would mix theirs otherwise.
+    """
     with dropped_if_closed():
-        print(line, flush=True)
+        print(f"{line}\n", end="", flush=True)
 
 
 def silent(line: str) -> None:
