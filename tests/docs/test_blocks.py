@@ -123,6 +123,7 @@ def small_paper(folder: pathlib.Path) -> dict[str, Any]:
     paper = tomllib.loads((ROOT / "pmt_jax" / "studies" / "paper.toml").read_text())
     for each in paper["tables"].values():
         each.update(methods=["f4sg"], baseline="f4sg", tasks=["lane"])
+        each.pop("budgets", None)  # the small ones below are for all tables
     lines = ['extends = "lane"', *(f"{name} = {value}" for name, value in BUDGET.items())]
     (folder / "lane.toml").write_text("\n".join(lines))
     return paper | {"budgets": dict.fromkeys(paper["budgets"], {"source": f"{folder}/{{task}}.toml"})}
