@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from envs.physics import usable_cpus
 from pmt_jax.errors import UsageError
 
 from . import compare, grid, records
@@ -78,10 +77,8 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
 
     bench, rows = BENCHES[name], []
     cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
-    shared = min(usable_cpus(), max((case.devices for case in cases), default=1))
-    if bench.on == "cpu" and shared > 1:  # before JAX starts
-        os.environ.setdefault("NPROC", str(processes.threads_for(shared)))
-        jax.config.update("jax_num_cpu_devices", shared)
+    if bench.on == "cpu":  # before JAX starts
+        processes.make_room(max((case.devices for case in cases), default=1))
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     flags = " --quick" * quick + f" --threads {threads}" * bool(threads) + f" --only '{only}'" * bool(only)

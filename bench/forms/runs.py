@@ -111,14 +111,15 @@ def as_pmt_table(file: pathlib.Path) -> str:
 
 def as_paper(file: pathlib.Path) -> str:
     """A line a run: mean ± standard deviation over seeds, as the paper has it, then the paper's own figures."""
-    found = table.summarise(in_order([_row(run) for run in load(file)]))
+    shown = in_order([_row(run) for run in load(file)])
+    found = table.summarise(shown)
     measured = [name for name in ("reward", "cost", "CR", "PL") if name in found[0]]
     published = [name for name in measured if any(name in row["paper"] for row in found)]
     head = ["method", *measured, "seeds within", "worst seed", *(f"paper {name}" for name in published)]
     several = len({row["cost_limit"] for row in found}) > 1
     body = []
-    for row in found:
-        line = [_label(row) + (f", limit {row['cost_limit']:g}" if several else "")]
+    for label, row in zip((row.label for row in shown), found, strict=True):
+        line = [label + (f", limit {row['cost_limit']:g}" if several else "")]
         line += [_mean_std(row[name]["mean"], row[name]["std"]) for name in measured]
         line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", f"{row['worst']:.2f}"]
         line += [_mean_std(*row["paper"][name]) if name in row["paper"] else "-" for name in published]
@@ -130,7 +131,7 @@ def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
     found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
     tasks = list(dict.fromkeys(row.task for row in found))
-    cells = {(_label(x), x["task"]): x for x in table.summarise(found)}
+    cells = {(row.label, row.task): x for row, x in zip(found, table.summarise(found), strict=True)}
     body = []
     for method in dict.fromkeys(row.label for row in found):
         line = [cells[method, task] for task in tasks]
@@ -193,11 +194,6 @@ def _row(run: Run) -> Row:
     scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
     settings = "pid" if tomllib.loads(run.get("config", "")).get("lambda_rule") == "pid" else ""
     return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], scores)
-
-
-def _label(row: dict[str, Any]) -> str:
-    """`Row.label` of plain data."""
-    return " ".join(filter(None, (row["method"], row["settings"])))
 
 
 def as_points(file: pathlib.Path) -> str:

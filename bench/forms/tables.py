@@ -106,9 +106,9 @@ def _efficiency(row: Row, rows: Rows) -> float | None:
 
 
 def _update_seconds(row: Row, rows: Rows) -> float | None:
-    if row["kind"] == "plain loop":
+    if "num_envs" not in row or not rate(row):
         return None
-    return row["seeds"] * row["num_envs"] * row["rollout_length"] / row["steps_per_second"] if rate(row) else None
+    return row["seeds"] * row["num_envs"] * row["rollout_length"] / row["steps_per_second"]
 
 
 def _times_mappo_l(row: Row, rows: Rows) -> float | None:

@@ -135,13 +135,13 @@ def side_by_side(*parts: functools.partial[Any]) -> tuple[Any, ...]:
     devices = 1 if _single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
     if devices == 1 or not _takes_whole_parts():
         return tuple(part() for part in parts)
-    leaves, structure = jax.tree.flatten([part.args for part in parts])
+    leaves, structure = jax.tree.flatten([(part.args, part.keywords) for part in parts])
 
     def taken_by(device: int, *arrays: jax.Array) -> tuple[Any, ...]:
         given, results = iter(arrays), []
         arguments = jax.tree.unflatten(structure, [next(given) if isinstance(x, jax.Array) else x for x in leaves])
-        for i, part in enumerate(parts):
-            result = functools.partial(part.func, *arguments[i])
+        for i, (part, (args, keywords)) in enumerate(zip(parts, arguments, strict=True)):
+            result = functools.partial(part.func, *args, **keywords)
             mine = i * min(devices, len(parts)) // len(parts) == device
             results.append(result() if mine else jax.tree.map(jnp.zeros_like, jax.eval_shape(result)))
         return tuple(results)
