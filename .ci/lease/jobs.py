@@ -27,8 +27,9 @@ METHODS = {"macpo": "macpo", "r4sg": "r4sg", "mixed": "mixed", "f4sg": "f4sg", "
 METHODS |= {"pid": "mappo_l --lambda-rule=pid --lambda-kp=0.5", "mappo": "mappo"}
 VELOCITY = {
     f"velocity/{task}-{name}": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={method}"
-    for task in ("half_cheetah_6x1", "swimmer_2x1", "hopper_3x1")
+    for tasks in (("half_cheetah_6x1", "swimmer_2x1", "hopper_3x1"), ("walker2d_2x3",))
     for name, method in METHODS.items()
+    for task in tasks
 }
 
 # Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, OTHER_ANT, then SPREAD and CELLS.
