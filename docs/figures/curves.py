@@ -31,6 +31,7 @@ FIGURES = {
     "table3_voltage_141": "table3_voltage_141_h200",
     "velocity_ant_2x4": "velocity_ant_2x4_h200",
     "velocity_half_cheetah_2x3": "velocity_half_cheetah_2x3_h200",
+    "velocity_half_cheetah_6x1": "velocity_half_cheetah_6x1_h200",
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
     "grid_33": "table3_voltage_33_h200",
