@@ -263,10 +263,23 @@ BENCHES = {
             *_alone("hand_over_2x6", (4096, 16_384), 100, physics="warp"),
             *_alone("hand_over_2x6", (16_384,), 100, physics="warp", solver="fast"),
             *_alone("hand_over_2x6", (4096,), 20, physics="mjx"),
-            *(case for task in ROBOTS for case in _alone(task, (16_384,), 100, physics="warp")),
             *(case for task in ("voltage_33", "voltage_141") for case in _alone(task, (4096, 65_536), 240)),
         ),
         _alone("voltage_33", (64,), 60),
+        on="gpu",
+        by_turns=False,
+    ),
+    "robots": Bench(
+        "GPU: velocity tasks: control steps/s of each robot alone; of training, five seeds",
+        tuple(
+            case
+            for task in ROBOTS
+            for case in (
+                *_alone(task, (2560, 16_384), 50, physics="warp"),
+                *(_training(task, "mappo_l", 5, *size, *_BATCH) for size in ((512, 32), (2048, 8))),
+            )
+        ),
+        _alone("velocity_hopper_3x1", (64,), 4),
         on="gpu",
         by_turns=False,
     ),

@@ -1,4 +1,7 @@
-"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved."""
+"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
+
+Its LAST commands follow one by one, alone on the machine.
+"""
 
 from __future__ import annotations
 
@@ -74,6 +77,9 @@ def main() -> None:
         except subprocess.TimeoutExpired:
             log(name, "did not end")
             process.kill()
+    for name, command in () if SMOKE else jobs.LAST.items():
+        process = start(0, name, command.split())
+        log(name, "ended with", process.wait())
 
 
 if __name__ == "__main__":

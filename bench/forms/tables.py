@@ -434,6 +434,9 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "engines": Table(
         "engines", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s", "compile, s")
     ),
+    "robots": Table(
+        "robots", ("environment", "training"), ("task", "measured", SIZES, "environment steps/s", "compile, s")
+    ),
     "substep": Table(
         "substep",
         ("substep",),
