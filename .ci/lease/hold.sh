@@ -4,14 +4,8 @@ cat /tmp/runs/queue.out
 for log in /tmp/runs/logs/*; do echo "$(basename "$log"): $(tail -c 200 "$log" | tr '\r' '\n' | tail -1)"; done
 nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
 cd /tmp && tar cf - --exclude=checkpoints runs | xz -T8 -3 > "$OUT/runs.tar.xz"
-# Policies apart and once, the newest checkpoint alone: an archive that is too large stays there, and the metrics must not
-# stay with it. Five seeds of a half cheetah have 12 MB: four policies a call.
-sent=0
-for run in $(cd /tmp && ls -d runs/runs/velocity/*-{happo,mappo_l,f4sg} 2> /dev/null); do
-  name=$(basename "$run")
-  if [ $sent -lt 4 ] && grep -q '^done:' "/tmp/runs/logs/velocity-$name" && mkdir "/tmp/sent-$name" 2> /dev/null; then
-    sent=$((sent + 1))
-    newest=$(ls "/tmp/$run/checkpoints" | sort -n | tail -1)
-    tar cf - -C /tmp "$run"/{config.toml,versions.json,metrics.jsonl} "$run/checkpoints/$newest" | xz -T8 -1 > "$OUT/$name.tar.xz"
-  fi
-done
+# Policies apart, each once, when its run has ended; the metrics must not stay there with an archive that is too large.
+ended=$(cd /tmp/runs/runs && for run in velocity/*-{happo,mappo_l,f4sg}; do
+  grep -qs '^done:' "/tmp/runs/logs/${run/\//-}" && echo "/tmp/runs/runs/$run"
+done)
+[ -z "$ended" ] || JAX_PLATFORMS=cpu PYTHONPATH=/tmp/site:/tmp/repo python3 /tmp/repo/.ci/lease/policies.py "$OUT" $ended
