@@ -33,7 +33,7 @@ VELOCITY = {
 }
 
 # Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, OTHER_ANT, then SPREAD and CELLS.
-PROGRAMS, JOBS = 6, VELOCITY
+PROGRAMS, JOBS = 4, VELOCITY
 
 # Alone on the machine afterwards, 25 s each; `16` is all that a word of --only may say of 16,384.
 LAST = {f"bench-{task}": f"-m bench run robots --only velocity_{task},environment,16" for task in ROBOTS}
