@@ -21,6 +21,13 @@ CELLS = {f"limits/{method}": f"{ANT} --method={method} {MULTIPLIER}" for method 
 MACPO = "--method=macpo --limit-lr=0.1 --kl-limit=0.03 --seed=440 --seeds=20 --cost-limit=10 --cost-margin=0.5"
 OTHER_ANT = {"limits/macpo_4x2": f"-m pmt_jax train paper/ant_4x2 {MACPO}"}
 
+# Table 1 of ant_2x4 where nobody can cheat (bench/sweeps/walls.toml); ten programs are about a lease.
+WALLS = {
+    f"walls/{walls}-{method}": f"-m pmt_jax train paper/ant_2x4 --method={method} --env walls={walls}"
+    for walls in ("costly", "solid")
+    for method in ("macpo", "f4sg", "mappo_l", "happo", "mappo")
+}
+
 # The velocity tasks' table, whole tasks first, what takes longest first in each. Ant 2x4 and the half cheetahs have run
 # (bench/results). After these three: ant_4x2 and humanoid_9_8.
 METHODS = {"macpo": "macpo", "r4sg": "r4sg", "mixed": "mixed", "f4sg": "f4sg", "mappo_l": "mappo_l"}
@@ -32,7 +39,7 @@ VELOCITY = {
     for name, method in METHODS.items()
 }
 
-# Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, OTHER_ANT, then SPREAD and CELLS.
+# Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, WALLS, OTHER_ANT, SPREAD, CELLS.
 PROGRAMS, JOBS = 4, VELOCITY
 
 # Alone on the machine afterwards, 25 s each; `16` is all that a word of --only may say of 16,384.
