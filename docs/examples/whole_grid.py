@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from envs.voltage.control import Scenario, VoltageControl, load_scenario
+from envs.voltage.control import VoltageControl, load_scenario
 from envs.voltage.profiles import load_profiles
 
 

@@ -14,7 +14,7 @@ import pytest
 import envs
 from envs.errors import TaskError
 from envs.voltage import profiles
-from places import DATA
+from places import DATA, ROOT
 
 FOLDER = DATA / "mapdn_format_case33"
 ROWS_A_DAY = 480
@@ -355,3 +355,14 @@ def test_baselines_order_as_they_should() -> None:
     assert rate["random"] < rate["zero"] < rate["droop"] <= rate["opf"]
     assert loss["opf"] < loss["droop"] < loss["random"]  # without control less is lost, but voltages are out
     np.testing.assert_allclose(rate["zero"], 1 - found["zero"]["violation_rate"], atol=1e-6)
+
+
+def test_the_example_of_a_whole_grid_changes_what_agents_see_and_nothing_else():
+    regions, whole = envs.make("voltage_141"), envs.make(f"{ROOT / 'docs/examples/whole_grid.py'}:make")
+    buses = regions.scenario.network.n_bus - 1  # without the slack
+    assert whole.spec.obs_dim == 4 * buses + 2 > regions.spec.obs_dim
+    assert whole.spec.state_dim == regions.spec.state_dim
+    np.testing.assert_array_equal(whole.profiles.pv, regions.profiles.pv)
+    np.testing.assert_array_equal(whole.s_max, regions.s_max)
+    assert whole.spec.cost_limit == regions.spec.cost_limit
+    assert whole.barrier == regions.barrier
