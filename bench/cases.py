@@ -276,7 +276,7 @@ BENCHES = {
             for task in ROBOTS
             for case in (
                 *_alone(task, (2560, 16_384), 50, physics="warp"),
-                *(_training(task, "mappo_l", 5, *size, *_BATCH) for size in ((512, 32), (2048, 8))),
+                *(_training(task, "mappo_l", 5, *size) for size in ((512, 32), (2048, 8))),
             )
         ),
         _alone("velocity_hopper_3x1", (64,), 4),

@@ -4,8 +4,6 @@ cat /tmp/runs/queue.out
 for log in /tmp/runs/logs/*; do echo "$(basename "$log"): $(tail -c 200 "$log" | tr '\r' '\n' | tail -1)"; done
 nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
 cd /tmp && tar cf - --exclude=checkpoints runs | xz -T8 -3 > "$OUT/runs.tar.xz"
-# Policies apart, each once, when its run has ended; the metrics must not stay there with an archive that is too large.
-ended=$(cd /tmp/runs/runs && for run in velocity/*-{happo,mappo_l,f4sg} walls/*; do
-  grep -qs '^done:' "/tmp/runs/logs/${run/\//-}" && echo "/tmp/runs/runs/$run"
-done)
+# Policies apart, each once, when its run has ended.
+ended=$(grep -ls '^done:' /tmp/runs/logs/{velocity-*-{happo,mappo_l,f4sg},walls-*} | sed -E 's,/logs/([a-z]+)-,/runs/\1/,')
 [ -z "$ended" ] || JAX_PLATFORMS=cpu PYTHONPATH=/tmp/site:/tmp/repo python3 /tmp/repo/.ci/lease/policies.py "$OUT" $ended

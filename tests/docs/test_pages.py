@@ -71,7 +71,7 @@ STATED: dict[str, dict[str, str]] = {
         "running at the thresholds": "3,522 3,227 2,932",
         "steps of the slowest runs, millions": "7.2 8.2",
         "costs and multipliers of the stored curves": "673 917 75 4.0 4.3 1.3 2.1 598 765 3.5 100 23",
-        "half of the limit, a reward that four to two seeds of five miss": "12.5 1,700",
+        "half of the limit, a reward that two to four seeds of five miss": "12.5 1,700",
         "minutes of a seed on a CPU": "6.4",
         "steps of an episode, level of intervals": "1,000 95",
         "rates of the logs": "534,000 700,000 371,000 390,000 125,000",
