@@ -192,7 +192,8 @@ def _mean_std(*mean_and_std: float) -> str:
 def _row(run: Run) -> Row:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
-    settings = "pid" if tomllib.loads(run.get("config", "")).get("lambda_rule") == "pid" else ""
+    rule = tomllib.loads(run.get("config", "")).get("lambda_rule")
+    settings = "pid" if rule == "pid" and METHODS[run["method"]].constraint == "lagrangian" else ""
     return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], scores)
 
 

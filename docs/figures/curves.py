@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from bench import records
 from bench.forms import runs
+from pmt_jax.config.methods import METHODS
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group
 
@@ -32,6 +33,8 @@ FIGURES = {
     "velocity_ant_2x4": "velocity_ant_2x4_h200",
     "velocity_half_cheetah_2x3": "velocity_half_cheetah_2x3_h200",
     "velocity_half_cheetah_6x1": "velocity_half_cheetah_6x1_h200",
+    "velocity_hopper_3x1": "velocity_hopper_3x1_h200",
+    "velocity_swimmer_2x1": "velocity_swimmer_2x1_h200",
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
     "grid_33": "table3_voltage_33_h200",
@@ -70,7 +73,8 @@ def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[
 
     A PID multiplier has dashes.
     """
-    pid = "lambda_rule=pid" in group.settings
+    rule = group.runs[0].settings.get("lambda_rule")
+    pid = rule == "pid" and METHODS[group.method].constraint == "lagrangian"
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))

@@ -11,7 +11,8 @@ from matplotlib.ticker import EngFormatter
 from bench.forms import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
-NAMES = {"mappo": "MAPPO", "happo": "HAPPO", "mappo_l pid": "PID", **study.NAMES}
+NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}
+NAMES |= {f"{method} pid": f"{name} PID" for method, name in NAMES.items()} | {"mappo_l pid": "PID"}
 DANGER = "#f6d5c3"  # a pale vermilion, where a step costs
 WALL = "#404040"
 GAP = 0.075  # of an axis' height, between two labels
