@@ -145,6 +145,11 @@ class Networks:
         """True at the weights of an actor's standard deviation: on these its Fisher matrix is diagonal."""
         return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, path[-1].key == "std"), params)
 
+    def with_std(self, params: Params, std_min: jax.Array | float) -> Params:
+        """An actor's weights with no standard deviation below `std_min`, in units of an action; 0 changes no bit."""
+        least = distributions.parameter(jnp.asarray(std_min))
+        return jax.tree.map(lambda is_std, x: jnp.where(is_std, jnp.maximum(x, least), x), self.is_std(params), params)
+
     def layers(self, params: Params) -> dict[str, jax.Array]:
         """The mean's weights under plain names, for every layer i and with a leading [N].
 

@@ -187,8 +187,10 @@ def update_policy(
 ) -> tuple[TrainState, Metrics]:
     """One policy's step on its rows [R, ...], given how far its costs [K] are beyond their limits."""
     if setup.method.constraint == "trust_region":
-        return _trust_region_steps(setup, hyper, net, rows, cost_excess, key)
-    return _clipped_epochs(setup, hyper, net, rows, key)
+        new, metrics = _trust_region_steps(setup, hyper, net, rows, cost_excess, key)
+    else:
+        new, metrics = _clipped_epochs(setup, hyper, net, rows, key)
+    return TrainState(setup.nets.with_std(new.params, hyper.std_min), new.opt_state), metrics
 
 
 def _clipped_epochs(
