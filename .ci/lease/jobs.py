@@ -28,8 +28,8 @@ WALLS = {
     for method in ("macpo", "f4sg", "mappo_l", "happo", "mappo")
 }
 
-# The velocity tasks' table, whole tasks first, what takes longest first in each. Ant 2x4, the half cheetahs, the swimmer
-# and the hopper have run (bench/results). After the walker: ant_4x2 and humanoid_9_8.
+# The velocity tasks' table, whole tasks first, what takes longest first in each. Five tasks have run (bench/results).
+# After the walker: ant_4x2 and humanoid_9_8.
 METHODS = {"macpo": "macpo", "r4sg": "r4sg", "mixed": "mixed", "f4sg": "f4sg", "mappo_l": "mappo_l"}
 METHODS |= {"integral": "mappo_l --lambda-rule=integral --lambda-kp=0", "happo": "happo", "mappo": "mappo"}
 ROBOTS = ("walker2d_2x3",)
