@@ -39,8 +39,12 @@ VELOCITY = {
     for name, method in METHODS.items()
 }
 
+# A lower bound of the standard deviation, a trial of 15 seeds a program (docs/appendix/preregistration.md).
+BOUND = "--preset=benchmark --method=mappo_l --seed=90 --seeds=5 --set std_min=0,0.05,0.1"
+STD = {f"std/{task}": f"-m pmt_jax sweep velocity_{task} {BOUND}" for task in ("swimmer_2x1", "hopper_3x1")}
+
 # Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, WALLS, OTHER_ANT, SPREAD, CELLS.
-PROGRAMS, JOBS = 4, VELOCITY
+PROGRAMS, JOBS = 4, STD | VELOCITY
 
 # Alone on the machine afterwards, 25 to 40 s each; `16` is all that a word of --only may say of 16,384.
 UNMEASURED = ("ant_2x4", "half_cheetah_2x3", "humanoid_9_8")
