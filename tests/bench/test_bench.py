@@ -399,6 +399,19 @@ def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
 
 
+def test_only_a_multiplier_is_called_pid(tmp_path: pathlib.Path):
+    """The setting is in the configuration of every method, also where nothing reads it."""
+    made = []
+    for method in ("mappo", "macpo", "f4sg"):
+        run = fake_run(tmp_path / method, lambda_rule='"pid"')
+        for file in (run / "config.toml", run / "metrics.jsonl"):
+            file.write_text(file.read_text().replace("happo", method))
+        made.append(run)
+    runs.store(made, tmp_path / "rules.json")
+    lines = runs.as_paper(tmp_path / "rules.json").splitlines()[2:]
+    assert [line.split(" | ")[0] for line in lines] == ["| mappo", "| macpo", "| f4sg pid"]
+
+
 def test_paths_of_ants_are_stored_and_drawn(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
