@@ -194,8 +194,16 @@ BENCHES = {
         (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
     ),
     "velocity": Bench(
-        "velocity tasks: control steps/s of each robot beside plain loops",
-        tuple(case for task in ROBOTS for case in (*_plain(task), *_alone(task, (64, 256), physics="mujoco"))),
+        "velocity tasks: control steps/s of each robot per engine beside plain loops",
+        tuple(
+            case
+            for task in ROBOTS
+            for case in (
+                *_plain(task),
+                *_alone(task, (64, 256), physics="mujoco"),
+                *_alone(task, (64,), physics="mjx"),
+            )
+        ),
         (*_plain("velocity_hopper_3x1"), *_alone("velocity_hopper_3x1", (64,), physics="mujoco")),
     ),
     "methods": Bench(
