@@ -116,7 +116,6 @@ STATED: dict[str, dict[str, str]] = {
         "thresholds": "0.04891 0.9613 1.641 2.418 2.522 2.932 3.227",
         "bounds of actions and heights": "0.2 0.4",
         "the original package's rates, from the issue that asked for the tasks": "1,100 5,500",
-        "ratios of rows of velocity.json": "1.22 1.06 1.28 1.11 0.95 0.92",
         "versions of MuJoCo": "2.3 3.17",
         "bounds of tests": "2e-5 1e-3 1e-4",
     },
