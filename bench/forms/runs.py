@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -189,11 +189,15 @@ def _mean_std(*mean_and_std: float) -> str:
     return " ± ".join(f"{x:,.{digits}f}" for x in mean_and_std)
 
 
+def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
+    """Whether a run's multiplier follows PID; the setting is there for methods without one, too."""
+    return METHODS[method].constraint == "lagrangian" and settings.get("lambda_rule") == "pid"
+
+
 def _row(run: Run) -> Row:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
-    rule = tomllib.loads(run.get("config", "")).get("lambda_rule")
-    settings = "pid" if rule == "pid" and METHODS[run["method"]].constraint == "lagrangian" else ""
+    settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
     return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], scores)
 
 

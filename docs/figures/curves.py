@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 
 from bench import records
 from bench.forms import runs
-from pmt_jax.config.methods import METHODS
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group
 
@@ -73,8 +72,7 @@ def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[
 
     A PID multiplier has dashes.
     """
-    rule = group.runs[0].settings.get("lambda_rule")
-    pid = rule == "pid" and METHODS[group.method].constraint == "lagrangian"
+    pid = runs.has_pid(group.method, group.runs[0].settings)
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))

@@ -190,7 +190,7 @@ def update_policy(
         new, metrics = _trust_region_steps(setup, hyper, net, rows, cost_excess, key)
     else:
         new, metrics = _clipped_epochs(setup, hyper, net, rows, key)
-    return TrainState(setup.nets.with_std(new.params, hyper.std_min), new.opt_state), metrics
+    return TrainState(setup.nets.with_std_min(new.params, hyper.std_min), new.opt_state), metrics
 
 
 def _clipped_epochs(
