@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import envs
 from envs.base import Env
@@ -101,3 +102,26 @@ def test_a_time_limit_that_terminates_leaves_nothing_to_bootstrap_from():
         assert (state.episode == 1).all()
         outcomes.append((outcome.terminated.tolist(), outcome.truncated.tolist()))
     assert outcomes == [([False] * 2, [True] * 2), ([True] * 2, [False] * 2)]
+
+
+@pytest.mark.parametrize("ends", [0, 1, 24, 25, 150])
+def test_those_that_end_start_anew_however_many_and_no_others(ends: int):
+    """Two batches of 150 side by side, one without an end; a CPU resets 24 at a time."""
+    vector = VectorEnv(Fragile(), 150)
+    ended = np.isin(np.arange(150), np.random.default_rng(ends).permutation(150)[:ends])
+    action = jnp.where(
+        jnp.stack([jnp.asarray(ended), jnp.zeros(150, bool)])[..., None, None], -1.0, jnp.full((2, 2), 0.5)
+    )
+    start = jax.vmap(vector.reset)(jax.random.split(jax.random.key(0)))
+    after, outcome = jax.jit(jax.vmap(vector.step))(start, action)
+    np.testing.assert_array_equal(outcome.terminated, [ended, np.zeros(150)])
+    np.testing.assert_array_equal(after.episode, [ended, np.zeros(150)])
+    np.testing.assert_array_equal(after.elapsed, [~ended, np.ones(150)])
+    keys = jax.vmap(jax.vmap(jax.random.fold_in))(start.key, after.episode)
+    fresh, moved = jax.vmap(jax.vmap(vector.env.reset))(keys), jax.vmap(jax.vmap(vector.env.step))(start.env, action)
+    for found, new, old in zip(*(jax.tree.leaves(x) for x in (after.env, fresh, moved)), strict=True):
+        if jnp.issubdtype(found.dtype, jax.dtypes.prng_key):
+            found, new, old = (jax.random.key_data(x) for x in (found, new, old))
+        np.testing.assert_array_equal(found[0, ended], new[0, ended])
+        np.testing.assert_array_equal(found[0, ~ended], old[0, ~ended])
+        np.testing.assert_array_equal(found[1], old[1])
