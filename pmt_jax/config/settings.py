@@ -74,11 +74,6 @@ class Hyper:
     entropy_coef: float = learning(
         0.0, "weight of the policy's entropy, in nats summed over action dimensions", NOT_NEGATIVE
     )
-    std_min: float = learning(
-        0.0,
-        "least standard deviation of an action, whose range is [-1, 1]; every update raises smaller ones to it",
-        Bound("lie in [0, 0.5)", lambda x: 0 <= x < 0.5),
-    )
     value_norm_decay: float = learning(0.995, "share of the running moments of returns that survives an update", SHARE)
     cost_limit: float | tuple[float, ...] = constraint(
         math.nan,

@@ -69,11 +69,6 @@ class Actor(nn.Module):
         return self.trunk(obs), std
 
 
-def _is_std(path: tuple[Any, ...]) -> bool:
-    """Whether a path in an actor's weights ends at the parameter of its standard deviation."""
-    return path[-1].key == "std"
-
-
 @dataclasses.dataclass(frozen=True)
 class Networks:
     """The functions of a run's networks; weights live elsewhere.
@@ -148,12 +143,7 @@ class Networks:
 
     def is_std(self, params: Params) -> Params:
         """True at the weights of an actor's standard deviation: on these its Fisher matrix is diagonal."""
-        return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, _is_std(path)), params)
-
-    def with_std_min(self, params: Params, std_min: jax.Array | float) -> Params:
-        """An actor's weights with no standard deviation below `std_min`, in units of an action; 0 changes no bit."""
-        least = distributions.parameter(jnp.asarray(std_min))
-        return jax.tree_util.tree_map_with_path(lambda path, x: jnp.maximum(x, least) if _is_std(path) else x, params)
+        return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, path[-1].key == "std"), params)
 
     def layers(self, params: Params) -> dict[str, jax.Array]:
         """The mean's weights under plain names, for every layer i and with a leading [N].

@@ -187,10 +187,8 @@ def update_policy(
 ) -> tuple[TrainState, Metrics]:
     """One policy's step on its rows [R, ...], given how far its costs [K] are beyond their limits."""
     if setup.method.constraint == "trust_region":
-        new, metrics = _trust_region_steps(setup, hyper, net, rows, cost_excess, key)
-    else:
-        new, metrics = _clipped_epochs(setup, hyper, net, rows, key)
-    return TrainState(setup.nets.with_std_min(new.params, hyper.std_min), new.opt_state), metrics
+        return _trust_region_steps(setup, hyper, net, rows, cost_excess, key)
+    return _clipped_epochs(setup, hyper, net, rows, key)
 
 
 def _clipped_epochs(

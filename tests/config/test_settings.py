@@ -81,7 +81,6 @@ def test_words_of_a_command_line_become_typed():
         ({"actor_lr": -1}, "actor_lr must be a number that is not negative"),
         ({"actor_lr": float("nan")}, "actor_lr must be a number that is not negative"),
         ({"kl_max": 0}, "kl_max must be a number of nats above 0, or inf"),
-        ({"std_min": 0.5}, "std_min must lie in [0, 0.5)"),
         ({"lr_half_life": 0}, "lr_half_life must be a number of steps above 0, or inf"),
         ({"cost_limit": -2}, "cost_limit must be a cost per episode of at least 0"),
         ({"hidden": ()}, "hidden must name at least one layer"),

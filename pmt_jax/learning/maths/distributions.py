@@ -14,11 +14,6 @@ def std(parameter: jax.Array) -> jax.Array:
     return STD_MAX * jax.nn.sigmoid(parameter)
 
 
-def parameter(std: jax.Array) -> jax.Array:
-    """The parameter l of a standard deviation in [0, 0.5); -inf for 0."""
-    return jax.scipy.special.logit(std / STD_MAX)
-
-
 def log_prob(action: jax.Array, mean: jax.Array, std: jax.Array, mask: jax.Array) -> jax.Array:
     """Log-density of `action` [..., A] in nats, summed over unmasked entries: [...]."""
     z = (action - mean) / std
