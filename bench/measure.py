@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import psutil
 
 import envs
+from envs.base import State
 from envs.physics import usable_cpus
+from envs.vector import restart
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training import jobs
@@ -104,26 +105,19 @@ def environment(case: Case) -> Build:
     """jit(scan(vmap(step))) with random actions, and with resets if an episode terminates."""
     named = {"physics": case.physics, "solver": case.solver}
     env = envs.make(case.task, **{name: word for name, word in named.items() if word}, **dict(case.settings))
-    shape = (case.seeds, case.num_envs)
-    step_all, reset_all = jax.vmap(jax.vmap(env.step)), jax.vmap(jax.vmap(env.reset))
+    batch = case.seeds * case.num_envs
+    step_all, reset_all = jax.vmap(env.step), jax.vmap(env.reset)
 
-    def step(state: Any, action_and_key: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+    def step(state: State, action_and_key: tuple[jax.Array, jax.Array]) -> tuple[State, jax.Array]:
         action, key = action_and_key
         after = step_all(state, action)
-
-        def restarted(after: Any) -> Any:
-            def either(new: jax.Array, old: jax.Array) -> jax.Array:
-                return jnp.where(after.terminated.reshape(*shape, *[1] * (new.ndim - 2)), new, old)
-
-            return jax.tree.map(either, reset_all(jax.random.split(key, shape)), after)
-
-        return jax.lax.cond(after.terminated.any(), restarted, lambda after: after, after), after.reward.sum()
+        return restart(env, after.terminated, after, jax.random.split(key, batch)), after.reward.sum()
 
     def build() -> Program:
-        actions = (case.rollout_length, *shape, env.spec.num_agents, env.spec.action_dim)
+        actions = (case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)
         drawn = jax.random.uniform(jax.random.key(1), actions, minval=-1, maxval=1)  # before, as the plain loop's are
         inputs = drawn, jax.random.split(jax.random.key(2), case.rollout_length)
-        box = [jax.jit(reset_all)(jax.random.split(jax.random.key(0), shape))]
+        box = [jax.jit(reset_all)(jax.random.split(jax.random.key(0), batch))]
         begin, cpu = time.perf_counter(), time.process_time()
         lowered = jax.jit(lambda state: jax.lax.scan(step, state, inputs)[0], donate_argnums=0).lower(box[0])
         traced = time.process_time()

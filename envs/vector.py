@@ -114,28 +114,29 @@ class VectorEnv:
         )
         done = terminated | truncated
         episode = state.episode + done
-        env = self._restart(done, after, jax.vmap(jax.random.fold_in)(state.key, episode))
+        env = restart(self.env, done, after, jax.vmap(jax.random.fold_in)(state.key, episode))
         return VectorState(env, jnp.where(done, 0, elapsed), episode, state.key), outcome
 
-    def _restart(self, done: jax.Array, env: State, key: jax.Array) -> State:
-        """`env`, where `done` [B] a fresh episode from `key` [B].
 
-        A CPU resets some at a time until none is left, as few end at once: all of them cost the humanoid an eighth of
-        its steps, and a grid under a vmap over seeds, which takes both sides of a condition, two thirds.
-        """
-        if jax.default_backend() != "cpu":  # its time is that of kernels, not of rows, and a loop's end is read back
-            return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(self.env.reset)(key), env), lambda: env)
-        batch = len(done)
-        size = min(batch, 8 * -(-batch // 64))  # whole vectors, or the bits would be those of a loop's remainder
+def restart(env: Env, done: jax.Array, state: State, key: jax.Array) -> State:
+    """`state` with a leading [B], but where `done` [B] a fresh episode from `key` [B].
 
-        def reset_some(left: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
-            done, env = left
-            (index,) = jnp.nonzero(done, size=size, fill_value=batch)
-            fresh = jax.vmap(self.env.reset)(key.at[index].get(mode="clip"))
-            env = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), env, fresh)
-            return done.at[index].set(False, mode="drop"), env
+    A CPU resets some at a time until none is left, as few end at once: all of them cost the humanoid an eighth of its
+    steps, and a grid under a vmap over seeds, which takes both sides of a condition, two thirds.
+    """
+    if jax.default_backend() != "cpu":  # its time is that of kernels, not of rows, and a loop's end is read back
+        return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(env.reset)(key), state), lambda: state)
+    batch = len(done)
+    size = min(batch, 8 * -(-batch // 128))  # whole vectors, or the bits would be those of a loop's remainder
 
-        return jax.lax.while_loop(lambda left: left[0].any(), reset_some, (done, env))[1]
+    def reset_some(left: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
+        done, state = left
+        (index,) = jnp.nonzero(done, size=size, fill_value=batch)
+        fresh = jax.vmap(env.reset)(key.at[index].get(mode="clip"))
+        state = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), state, fresh)
+        return done.at[index].set(False, mode="drop"), state
+
+    return jax.lax.while_loop(lambda left: left[0].any(), reset_some, (done, state))[1]
 
 
 def felt_cost(

@@ -28,33 +28,26 @@ WALLS = {
     for method in ("macpo", "f4sg", "mappo_l", "happo", "mappo")
 }
 
-# The velocity tasks' table, whole tasks first, what takes longest first in each. Five tasks have run (bench/results).
-# After the walker: ant_4x2 and humanoid_9_8.
+# The velocity tasks' table, whole tasks first, what takes longest first in each. Five tasks and four rows of the walker
+# have run (bench/results). After ant_4x2: humanoid_9_8.
 METHODS = {"macpo": "macpo", "r4sg": "r4sg", "mixed": "mixed", "f4sg": "f4sg", "mappo_l": "mappo_l"}
 METHODS |= {"integral": "mappo_l --lambda-rule=integral --lambda-kp=0", "happo": "happo", "mappo": "mappo"}
-ROBOTS = ("walker2d_2x3",)
+ROWS = [("walker2d_2x3", name) for name in ("mappo_l", "integral", "happo", "mappo")]
+ROWS += [("ant_4x2", name) for name in METHODS]
 VELOCITY = {
-    f"velocity/{task}-{name}": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={method}"
-    for task in ROBOTS
-    for name, method in METHODS.items()
+    f"velocity/{task}-{name}": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={METHODS[name]}"
+    for task, name in ROWS
 }
 
-# A lower bound of the standard deviation, a trial of 15 seeds a program (docs/appendix/preregistration.md).
-TUNED = "--preset=benchmark --method=mappo_l --seed=90 --seeds=5"
-BOUND = f"{TUNED} --set std_min=0,0.05,0.1"
-STD = {f"std/{task}": f"-m pmt_jax sweep velocity_{task} {BOUND}" for task in ("swimmer_2x1", "hopper_3x1")}
-
-# And an entropy bonus; on the swimmer and the hopper the runs without one are those of STD.
-ENTROPY = {
-    "entropy/swimmer_2x1": f"-m pmt_jax train velocity_swimmer_2x1 {TUNED} --entropy-coef=0.03",
-    "entropy/hopper_3x1": f"-m pmt_jax train velocity_hopper_3x1 {TUNED} --entropy-coef=0.03",
-    "entropy/walker2d_2x3": f"-m pmt_jax sweep velocity_walker2d_2x3 {TUNED} --set entropy_coef=0,0.03",
-    "entropy/half_cheetah_2x3": f"-m pmt_jax sweep velocity_half_cheetah_2x3 {TUNED} --set entropy_coef=0,0.03",
+# And PID for the other methods with a multiplier on the first three tasks, which ran with the integral rule.
+PID = {
+    f"velocity/{task}-{method}-pid": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={method} --seed=10"
+    for task in ("half_cheetah_2x3", "half_cheetah_6x1", "ant_2x4")
+    for method in ("r4sg", "mixed", "f4sg")
 }
 
-# Programs at a time on a GPU, and the runs. After these: VELOCITY's other tasks, WALLS, OTHER_ANT, SPREAD, CELLS.
-PROGRAMS, JOBS = 4, STD | ENTROPY | VELOCITY
+# Programs at a time on a GPU, and the runs. After these: the humanoid, WALLS, OTHER_ANT, SPREAD, CELLS.
+PROGRAMS, JOBS = 4, VELOCITY | PID
 
-# Alone on the machine afterwards, 25 to 40 s each; `16` is all that a word of --only may say of 16,384.
-UNMEASURED = ("ant_2x4", "half_cheetah_2x3", "humanoid_9_8")
-LAST = {f"bench-{task}": f"-m bench run robots --only velocity_{task},environment,16" for task in UNMEASURED}
+# Alone on the machine afterwards; `16` is all that a word of --only may say of 16,384.
+LAST = {"bench-humanoid_9_8": "-m bench run robots --only velocity_humanoid_9_8,environment,16"}
