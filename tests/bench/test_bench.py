@@ -331,12 +331,16 @@ def stored() -> dict[str, list[runs.Run]]:
     return {name: x for name, x in found.items() if isinstance(x, list) and "table" in x[0]}
 
 
+GONE = {"velocity_entropy_h200": {"std_min"}}  # left the program after its trial (docs/appendix/velocity.md)
+
+
 @pytest.mark.parametrize("name", stored())
 def test_settings_of_stored_runs_have_their_present_names(name: str):
+    known = {*FIELDS, *GONE.get(name, ())}
     for run in stored()[name]:
-        assert set(tomllib.loads(run.get("config", ""))) <= set(FIELDS)
+        assert set(tomllib.loads(run.get("config", ""))) <= known
         named = re.findall(r"([\w.]+) ?= ?", run.get("label", ""))
-        assert {word.split(".")[0] for word in named} <= set(FIELDS)
+        assert {word.split(".")[0] for word in named} <= known
 
 
 SWEEPS = sorted((ROOT / "bench" / "sweeps").glob("*.toml"))
