@@ -46,7 +46,15 @@ PID = {
     for method in ("r4sg", "mixed", "f4sg")
 }
 
-# Programs at a time on a GPU, and the runs. After these: the humanoid, WALLS, OTHER_ANT, SPREAD, CELLS.
+# Limits of 5 and 0.2, ten trials a program.
+TIGHT = {
+    f"tight/{task}-{method}": f"-m pmt_jax sweep velocity_{task} --preset=benchmark --method={method}"
+    " --seed=20 --seeds=5 --set cost_limit=5,0.2"
+    for task in ("half_cheetah_2x3", "ant_2x4")
+    for method in ("macpo", "r4sg", "mixed", "f4sg", "mappo_l")
+}
+
+# Programs at a time on a GPU, and the runs. After these: TIGHT, the humanoid, WALLS, OTHER_ANT, SPREAD, CELLS.
 PROGRAMS, JOBS = 4, VELOCITY | PID
 
 # Alone on the machine afterwards; `16` is all that a word of --only may say of 16,384.
