@@ -75,6 +75,7 @@ class VectorEnv:
         self.num_envs = num_envs
         self.horizon = horizon or env.spec.horizon
         self._limit_terminates = limit_terminates
+        self.resets_all = False  # in every step, even on a CPU
 
     @property
     def spec(self) -> EnvSpec:
@@ -114,17 +115,19 @@ class VectorEnv:
         )
         done = terminated | truncated
         episode = state.episode + done
-        env = restart(self.env, done, after, jax.vmap(jax.random.fold_in)(state.key, episode))
+        key = jax.vmap(jax.random.fold_in)(state.key, episode)
+        env = restart(self.env, done, after, key, self.resets_all or jax.default_backend() != "cpu")
         return VectorState(env, jnp.where(done, 0, elapsed), episode, state.key), outcome
 
 
-def restart(env: Env, done: jax.Array, state: State, key: jax.Array) -> State:
-    """`state` with a leading [B], but where `done` [B] a fresh episode from `key` [B].
+def restart(env: Env, done: jax.Array, state: State, key: jax.Array, resets_all: bool) -> State:
+    """`state` with a leading [B], but where `done` [B] a fresh episode from `key` [B]; no bit depends on `resets_all`.
 
     A CPU resets some at a time until none is left, as few end at once: all of them cost the humanoid an eighth of its
-    steps, and a grid under a vmap over seeds, which takes both sides of a condition, two thirds.
+    steps, and a grid under a vmap over seeds, which takes both sides of a condition, two thirds. The time of a GPU is
+    that of kernels and not of rows, and it would have to read back whether a loop ends.
     """
-    if jax.default_backend() != "cpu":  # its time is that of kernels, not of rows, and a loop's end is read back
+    if resets_all:
         return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(env.reset)(key), state), lambda: state)
     batch = len(done)
     size = min(batch, 8 * -(-batch // 128))  # whole vectors, or the bits would be those of a loop's remainder

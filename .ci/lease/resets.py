@@ -26,7 +26,7 @@ TASKS = ("velocity_ant_2x4", "voltage_33")
 
 
 def looped(share: int) -> Callable[..., Any]:
-    def restart(env: Any, done: jax.Array, state: Any, key: jax.Array) -> Any:
+    def restart(env: Any, done: jax.Array, state: Any, key: jax.Array, _: bool) -> Any:
         size = max(1, len(done) // share)
 
         def reset_some(left: Any) -> Any:

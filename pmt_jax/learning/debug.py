@@ -52,6 +52,7 @@ def watched(setup: Setup, update: jax.Array) -> tasks.VectorEnv:
     if not setup.debug:
         return setup.vector
     vector = copy.copy(setup.vector)
+    vector.resets_all = True  # checkify knows no loop under a vmap
     vector.env = _Watched(vector.env, functools.partial(check_finite, setup, update))
     return vector
 

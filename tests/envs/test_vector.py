@@ -104,12 +104,12 @@ def test_a_time_limit_that_terminates_leaves_nothing_to_bootstrap_from():
     assert outcomes == [([False] * 2, [True] * 2), ([True] * 2, [False] * 2)]
 
 
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize("resets_all", [False, True])
 @pytest.mark.parametrize("ends", [0, 1, 16, 17, 150])
-def test_those_that_end_start_anew_however_many_and_no_others(monkeypatch: pytest.MonkeyPatch, backend: str, ends: int):
+def test_those_that_end_start_anew_however_many_and_no_others(ends: int, resets_all: bool):
     """Two batches of 150 side by side, one without an end; a CPU resets 16 at a time."""
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     vector = VectorEnv(Fragile(), 150)
+    vector.resets_all = resets_all
     ended = np.isin(np.arange(150), np.random.default_rng(ends).permutation(150)[:ends])
     action = jnp.where(
         jnp.stack([jnp.asarray(ended), jnp.zeros(150, bool)])[..., None, None], -1.0, jnp.full((2, 2), 0.5)
