@@ -111,8 +111,7 @@ def environment(case: Case) -> Build:
     def step(state: State, action_and_key: tuple[jax.Array, jax.Array]) -> tuple[State, jax.Array]:
         action, key = action_and_key
         after = step_all(state, action)
-        keys = jax.random.split(key, batch)
-        return restart(env, after.terminated, after, keys, jax.default_backend() != "cpu"), after.reward.sum()
+        return restart(env, after.terminated, after, jax.random.split(key, batch)), after.reward.sum()
 
     def build() -> Program:
         actions = (case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)

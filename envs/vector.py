@@ -116,25 +116,30 @@ class VectorEnv:
         done = terminated | truncated
         episode = state.episode + done
         key = jax.vmap(jax.random.fold_in)(state.key, episode)
-        env = restart(self.env, done, after, key, self.resets_all or jax.default_backend() != "cpu")
+        env = restart(self.env, done, after, key, self.resets_all)
         return VectorState(env, jnp.where(done, 0, elapsed), episode, state.key), outcome
 
 
-def restart(env: Env, done: jax.Array, state: State, key: jax.Array, resets_all: bool) -> State:
+def restart(env: Env, done: jax.Array, state: State, key: jax.Array, resets_all: bool = False) -> State:
     """`state` with a leading [B], but where `done` [B] a fresh episode from `key` [B]; no bit depends on `resets_all`.
 
-    A CPU resets some at a time until none is left, as few end at once: all of them cost the humanoid an eighth of its
-    steps, and a grid under a vmap over seeds, which takes both sides of a condition, two thirds. The time of a GPU is
-    that of kernels and not of rows, and it would have to read back whether a loop ends.
+    A CPU resets some at a time, as few end at once: all of them cost the humanoid an eighth of its steps, and a grid
+    under a vmap over seeds, which takes both sides of a condition, two thirds. The time of a GPU is that of kernels and
+    not of rows, and it would have to read back whether a loop ends.
     """
-    if resets_all:
+    if resets_all or jax.default_backend() != "cpu":
         return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(env.reset)(key), state), lambda: state)
+    at_once = 8 * -(-len(done) // 128)  # whole vectors, or the bits would be those of a loop's remainder
+    return restart_some(env, done, state, key, min(len(done), at_once))
+
+
+def restart_some(env: Env, done: jax.Array, state: State, key: jax.Array, at_once: int) -> State:
+    """The same, `at_once` environments at a time until none is left."""
     batch = len(done)
-    size = min(batch, 8 * -(-batch // 128))  # whole vectors, or the bits would be those of a loop's remainder
 
     def reset_some(left: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
         done, state = left
-        (index,) = jnp.nonzero(done, size=size, fill_value=batch)
+        (index,) = jnp.nonzero(done, size=at_once, fill_value=batch)
         fresh = jax.vmap(env.reset)(key.at[index].get(mode="clip"))
         state = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), state, fresh)
         return done.at[index].set(False, mode="drop"), state

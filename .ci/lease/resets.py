@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import envs
@@ -27,16 +26,7 @@ TASKS = ("velocity_ant_2x4", "voltage_33")
 
 def looped(share: int) -> Callable[..., Any]:
     def restart(env: Any, done: jax.Array, state: Any, key: jax.Array, _: bool) -> Any:
-        size = max(1, len(done) // share)
-
-        def reset_some(left: Any) -> Any:
-            done, state = left
-            (index,) = jnp.nonzero(done, size=size, fill_value=len(done))
-            fresh = jax.vmap(env.reset)(key.at[index].get(mode="clip"))
-            state = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), state, fresh)
-            return done.at[index].set(False, mode="drop"), state
-
-        return jax.lax.while_loop(lambda left: left[0].any(), reset_some, (done, state))[1]
+        return vector.restart_some(env, done, state, key, max(1, len(done) // share))
 
     return restart
 
