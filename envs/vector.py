@@ -75,7 +75,7 @@ class VectorEnv:
         self.num_envs = num_envs
         self.horizon = horizon or env.spec.horizon
         self._limit_terminates = limit_terminates
-        self.resets_all = False  # in every step, even on a CPU
+        self.resets_all = False  # in every step, whether any has ended or not
 
     @property
     def spec(self) -> EnvSpec:
@@ -123,19 +123,15 @@ class VectorEnv:
 def restart(env: Env, done: jax.Array, state: State, key: jax.Array, resets_all: bool = False) -> State:
     """`state` with a leading [B], but where `done` [B] a fresh episode from `key` [B]; no bit depends on `resets_all`.
 
-    A CPU resets some at a time, as few end at once: all of them cost the humanoid an eighth of its steps, and a grid
-    under a vmap over seeds, which takes both sides of a condition, two thirds. The time of a GPU is that of kernels and
-    not of rows, and it would have to read back whether a loop ends.
+    A loop runs while anything that has ended is left. A condition would do the same for one seed, but a vmap over seeds
+    takes both of its sides in every step, which costs a grid half of its steps on a GPU and two thirds on a CPU. There
+    the loop takes some at a time, as few end at once. On a GPU more rows take hardly longer.
     """
-    if resets_all or jax.default_backend() != "cpu":
-        return jax.lax.cond(jnp.any(done), lambda: _where(done, jax.vmap(env.reset)(key), state), lambda: state)
-    at_once = 8 * -(-len(done) // 128)  # whole vectors, or the bits would be those of a loop's remainder
-    return restart_some(env, done, state, key, min(len(done), at_once))
-
-
-def restart_some(env: Env, done: jax.Array, state: State, key: jax.Array, at_once: int) -> State:
-    """The same, `at_once` environments at a time until none is left."""
+    if resets_all:
+        return _where(done, jax.vmap(env.reset)(key), state)
     batch = len(done)
+    some = 8 * -(-batch // 128)  # whole vectors, or the bits would be those of a loop's remainder
+    at_once = min(batch, some) if jax.default_backend() == "cpu" else batch
 
     def reset_some(left: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
         done, state = left

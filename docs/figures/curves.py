@@ -34,6 +34,7 @@ FIGURES = {
     "velocity_half_cheetah_6x1": "velocity_half_cheetah_6x1_h200",
     "velocity_hopper_3x1": "velocity_hopper_3x1_h200",
     "velocity_swimmer_2x1": "velocity_swimmer_2x1_h200",
+    "velocity_walker2d_2x3": "velocity_walker2d_2x3_h200",
     "ant_2x4_r4sg": "ant_2x4_r4sg",
     "hand_over_training": "hand_over_training",
     "grid_33": "table3_voltage_33_h200",
