@@ -10,6 +10,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import itertools
 import statistics
 import subprocess
 import time
@@ -114,12 +115,15 @@ def environment(case: Case) -> Build:
         return restart(env, after.terminated, after, jax.random.split(key, batch)), after.reward.sum()
 
     def build() -> Program:
-        actions = (case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)
-        drawn = jax.random.uniform(jax.random.key(1), actions, minval=-1, maxval=1)  # before, as the plain loop's are
-        inputs = drawn, jax.random.split(jax.random.key(2), case.rollout_length)
+        # Drawn before, and for as many steps as a plain loop draws: few that come again make other motions.
+        calls = -(-plain.STEPS // case.rollout_length)
+        actions = (calls, case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)
+        drawn = jax.random.uniform(jax.random.key(1), actions, minval=-1, maxval=1)
+        inputs = itertools.cycle(list(zip(drawn, jax.random.split(jax.random.key(2), actions[:2]), strict=True)))
         box = [jax.jit(reset_all)(jax.random.split(jax.random.key(0), batch))]
         begin, cpu = time.perf_counter(), time.process_time()
-        lowered = jax.jit(lambda state: jax.lax.scan(step, state, inputs)[0], donate_argnums=0).lower(box[0])
+        rollout = jax.jit(lambda state, inputs: jax.lax.scan(step, state, inputs)[0], donate_argnums=0)
+        lowered = rollout.lower(box[0], next(inputs))
         traced = time.process_time()
         program = lowered.compile()
         facts = {
@@ -129,7 +133,7 @@ def environment(case: Case) -> Build:
         }
 
         def call() -> None:
-            box[0] = jax.block_until_ready(program(box[0]))
+            box[0] = jax.block_until_ready(program(box[0], next(inputs)))
 
         return Program(call, case.rollout_length * case.seeds * case.num_envs, facts)
 

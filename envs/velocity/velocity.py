@@ -277,13 +277,14 @@ class Velocity:
         bound = self.robot.velocity_bound
         parts = [physics.qpos[self.robot.unseen :], jnp.clip(physics.qvel, -bound, bound)]
         parts += [out[name].reshape(-1) for name in _FORCES] if self.robot.sees_forces else []
-        state = jnp.concatenate(parts)
+        seen = state = jnp.concatenate(parts)
         index = jnp.eye(self.spec.num_agents, dtype=state.dtype)
-        obs = jnp.concatenate([jnp.broadcast_to(state, (len(index), *state.shape)), index], axis=1)
-        if not self._standardise:
-            return obs, state
-        obs = (obs - obs.mean(axis=1, keepdims=True)) / obs.std(axis=1, keepdims=True)
-        return obs, (state - state.mean()) / (state.std() + 1e-8)
+        if self._standardise:
+            # The entries of all agents are the same but for their order, and so are their mean and their spread.
+            entries = jnp.concatenate([state, index[0]])
+            seen, index = ((x - entries.mean()) / entries.std() for x in (seen, index))
+            state = (state - state.mean()) / (state.std() + 1e-8)
+        return jnp.concatenate([jnp.broadcast_to(seen, (len(index), *seen.shape)), index], axis=1), state
 
     def _get_speed(self, velocity: jax.Array) -> jax.Array:
         """[] m/s, what the threshold is for."""
