@@ -136,7 +136,7 @@ def _serve(pipe: Connection, name: str, seed: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C ends the bench, and that its workers
     task = TASKS[name]()
     _loop(task, seed)
-    with contextlib.suppress(EOFError, BrokenPipeError):
+    with contextlib.suppress(EOFError, ConnectionError):
         while True:
             pipe.send(None)
             pipe.recv()

@@ -157,9 +157,9 @@ class Workers:
     def close(self) -> None:
         """Ends the workers, which have nothing to save."""
         for pipe, process in zip(self._pipes, self._processes, strict=True):
-            pipe.close()
             process.kill()
             process.communicate()
+            pipe.close()
 
 
 def _joined(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -186,7 +186,7 @@ def serve() -> None:
         pipe.send(error)
         return
     pipe.send((pack(state), programs.measures, said[-1]))
-    with contextlib.suppress(EOFError):
+    with contextlib.suppress(EOFError, ConnectionError):  # a run that was killed may leave a result unread
         while True:
             program, packed = pipe.recv()
             given = unpack(packed, state) if packed else state

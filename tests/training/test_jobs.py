@@ -6,11 +6,14 @@ import pathlib
 import signal
 import subprocess
 import sys
+from multiprocessing.connection import Pipe
 
 import numpy as np
 import psutil
 import pytest
 
+from pmt_jax import load_config
+from pmt_jax.training import jobs
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, saved
 
 JOBS = ("train", *ARGUMENTS, "--jobs", 2)
@@ -75,6 +78,21 @@ def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathli
     psutil.wait_procs([first], timeout=60)
     assert not first.is_running()
     assert cli(*JOBS, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
+
+
+@pytest.mark.full
+def test_a_worker_says_nothing_when_its_run_ends_with_a_result_unread():
+    ours, theirs = Pipe()
+    command = [sys.executable, "-c", jobs.START, str(theirs.fileno())]
+    streams = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment(), text=True, **streams)
+    theirs.close()
+    ours.send((load_config("lane", num_envs=2, rollout_length=4, seeds=1), {}))
+    ours.recv()
+    ours.send(("chunk", {}))
+    assert ours.poll(60)
+    ours.close()
+    assert process.wait(60) == 0 and process.stderr and process.stderr.read() == ""
 
 
 @pytest.mark.full
