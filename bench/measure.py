@@ -114,12 +114,15 @@ def environment(case: Case) -> Build:
         after = step_all(state, action)
         return restart(env, after.terminated, after, jax.random.split(key, batch)), after.reward.sum()
 
+    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Actions and keys of a call."""
+        shape = (case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)
+        return jax.random.uniform(key, shape, minval=-1, maxval=1), jax.random.split(key, case.rollout_length)
+
     def build() -> Program:
         # Drawn before, and for as many steps as a plain loop draws: few that come again make other motions.
-        calls = -(-plain.STEPS // case.rollout_length)
-        actions = (calls, case.rollout_length, batch, env.spec.num_agents, env.spec.action_dim)
-        drawn = jax.random.uniform(jax.random.key(1), actions, minval=-1, maxval=1)
-        inputs = itertools.cycle(list(zip(drawn, jax.random.split(jax.random.key(2), actions[:2]), strict=True)))
+        calls = jax.random.split(jax.random.key(1), -(-plain.STEPS // case.rollout_length))
+        inputs = itertools.cycle([draw(key) for key in calls])
         box = [jax.jit(reset_all)(jax.random.split(jax.random.key(0), batch))]
         begin, cpu = time.perf_counter(), time.process_time()
         rollout = jax.jit(lambda state, inputs: jax.lax.scan(step, state, inputs)[0], donate_argnums=0)

@@ -282,7 +282,8 @@ class Velocity:
         if self._standardise:
             # The entries of all agents are the same but for their order, and so are their mean and their spread.
             entries = jnp.concatenate([state, index[0]])
-            seen, index = ((x - entries.mean()) / entries.std() for x in (seen, index))
+            mean, spread = entries.mean(), entries.std()
+            seen, index = (state - mean) / spread, (index - mean) / spread
             state = (state - state.mean()) / (state.std() + 1e-8)
         return jnp.concatenate([jnp.broadcast_to(seen, (len(index), *seen.shape)), index], axis=1), state
 

@@ -85,14 +85,14 @@ def test_a_worker_says_nothing_when_its_run_ends_with_a_result_unread():
     ours, theirs = Pipe()
     command = [sys.executable, "-c", jobs.START, str(theirs.fileno())]
     streams = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment(), text=True, **streams)
-    theirs.close()
-    ours.send((load_config("lane", num_envs=2, rollout_length=4, seeds=1), {}))
-    ours.recv()
-    ours.send(("chunk", {}))
-    assert ours.poll(60)
-    ours.close()
-    assert process.wait(60) == 0 and process.stderr and process.stderr.read() == ""
+    with subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment(), text=True, **streams) as process:
+        theirs.close()
+        ours.send((load_config("lane", num_envs=2, rollout_length=4, seeds=1), {}))
+        ours.recv()
+        ours.send(("chunk", {}))
+        assert ours.poll(60)
+        ours.close()
+        assert process.wait(60) == 0 and process.stderr and process.stderr.read() == ""
 
 
 @pytest.mark.full
