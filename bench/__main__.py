@@ -74,6 +74,7 @@ def _add_showing(commands: Any) -> None:
     stored = command(commands, "store", _store, "training runs as a result")
     stored.add_argument("folders", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
+    stored.add_argument("--same-end", action="store_true", help="read all at the last step that every run reached")
     published = command(commands, "publish", _publish, "make pretrained policies of runs, and report their metrics")
     published.add_argument(
         "folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders, or hub:NAME to measure it anew"
@@ -124,7 +125,7 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _store(arguments: argparse.Namespace) -> int:
-    say(f"{runs.store(arguments.folders, arguments.out)} run(s) in {arguments.out}")
+    say(f"{runs.store(arguments.folders, arguments.out, arguments.same_end)} run(s) in {arguments.out}")
     return 0
 
 

@@ -31,9 +31,17 @@ WHILE_TRAINING = "cost while training"
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
-def store(folders: Sequence[pathlib.Path], out: pathlib.Path) -> int:
-    """Writes the run folders among and below `folders` into a JSON file; returns how many there are."""
-    found = [_compact(run) | {"label": group.label} for group in groups(read_all(folders)) for run in group.runs]
+def store(folders: Sequence[pathlib.Path], out: pathlib.Path, same_end: bool = False) -> int:
+    """Writes the run folders among and below `folders` into a JSON file; returns how many there are.
+
+    Args:
+      same_end: all runs are read as if they had ended at the last step that every one of them reached.
+    """
+    logs = read_all(folders)
+    if same_end:
+        end = min(log.steps[-1] for log in logs)
+        logs = [log.until(end) for log in logs]
+    found = [_compact(run) | {"label": group.label} for group in groups(logs) for run in group.runs]
     out.write_text(json.dumps(found, separators=(",", ":")) + "\n")
     return len(found)
 

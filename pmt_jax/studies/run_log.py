@@ -109,6 +109,12 @@ class RunLog:
         found = self.final(name)
         return np.full(len(self.seeds), np.nan) if found is None else found
 
+    def until(self, step: int) -> RunLog:
+        """The same run as if it had ended after this step."""
+        kept = self.steps <= step
+        metrics = {name: values[:, kept] for name, values in self.metrics.items()}
+        return dataclasses.replace(self, steps=self.steps[kept], metrics=metrics)
+
     def thinned(self, points: int) -> RunLog:
         """The same run with its metrics averaged into at most so many points, over what is known in each."""
         starts = [part[0] for part in np.array_split(np.arange(len(self.steps)), min(points, len(self.steps)))]

@@ -393,6 +393,17 @@ def test_a_block_of_stored_runs_is_their_table(tmp_path: pathlib.Path, monkeypat
             render.render(block.format(name, ""), {})
 
 
+def test_runs_are_stored_as_if_all_had_ended_with_the_first(tmp_path: pathlib.Path):
+    long, short = (fake_run(tmp_path / "runs" / name, clip=clip) for name, clip in (("long", 0.1), ("short", 0.2)))
+    rows = [line for line in (short / "metrics.jsonl").read_text().splitlines() if json.loads(line)["step"] <= 200]
+    (short / "metrics.jsonl").write_text("\n".join(rows) + "\n")
+    out = tmp_path / "both.json"
+    assert main(["store", str(long), str(short), "-o", str(out), "--same-end"]) == 0
+    both = runs.load(out)
+    assert [run["steps"][-1] for run in both] == [200, 200]
+    assert both[0]["table"] == both[1]["table"]
+
+
 def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     for clip in (0.1, 0.2):
         fake_run(tmp_path / "runs" / f"clip={clip}", clip=clip)

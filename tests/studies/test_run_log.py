@@ -24,6 +24,14 @@ def test_metrics_are_read_as_they_stand(tmp_path: pathlib.Path):
     np.testing.assert_allclose(thin.metrics["episode_reward"][0, :2], [5.5, 15.5])
 
 
+def test_a_run_can_be_read_as_if_it_had_ended_earlier(tmp_path: pathlib.Path):
+    log = run_log.read(written(tmp_path / "a", [row(step, 0, float(step)) for step in range(1, 1001)]))
+    early = log.until(500)
+    assert early.steps[-1] == 500
+    np.testing.assert_allclose(early.final("episode_reward"), [np.mean(range(451, 501))])
+    np.testing.assert_array_equal(log.until(1000).metrics["episode_reward"], log.metrics["episode_reward"])
+
+
 def test_the_final_metrics_of_a_seed_that_broke_are_unknown(tmp_path: pathlib.Path):
     both = [row(10, 0, 1.0, broken=None), row(10, 1, 1.0, broken="critic/loss is nan")]
     log = run_log.read(written(tmp_path / "a", both))
