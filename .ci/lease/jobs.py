@@ -57,8 +57,9 @@ TIGHT = {
     for method in ("macpo", "r4sg", "mixed", "f4sg", "mappo_l")
 }
 
-# Programs at a time on a GPU, and the runs. After these: CELLS, TIGHT, PID, WALLS, OTHER_ANT, VELOCITY.
-PROGRAMS, JOBS = 4, SPREAD
+# Programs at a time on a GPU, and the runs. OTHER_ANT is for a machine with two GPUs.
+# After these: CELLS, TIGHT, PID, WALLS, VELOCITY.
+PROGRAMS, JOBS = 4, SPREAD | OTHER_ANT
 
 # Alone on the machine afterwards: what follows `python`. The training of robots takes some 45 s each, so lower END.
 ROBOTS = ("half_cheetah_2x3", "hopper_3x1", "walker2d_2x3", "swimmer_2x1", "ant_2x4", "humanoid_9_8")
