@@ -65,8 +65,8 @@ def _compact(log: RunLog) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
-    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean cost of all episodes while
-    it trained.
+    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost's curve, whose
+    points count alike.
     """
     found, (row,) = log.thinned(plot.POINTS), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
@@ -129,7 +129,7 @@ def as_paper(file: pathlib.Path) -> str:
     for label, row in zip((row.label for row in shown), found, strict=True):
         line = [label + (f", limit {row['cost_limit']:g}" if several else "")]
         line += [_mean_std(row[name]["mean"], row[name]["std"]) for name in measured]
-        line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", f"{row['worst']:.2f}"]
+        line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", _number(row["worst"], ".2f")]
         line += [_mean_std(*row["paper"][name]) if name in row["paper"] else "-" for name in published]
         body.append(line)
     return markdown(head, body)
@@ -144,7 +144,8 @@ def as_summary(files: pathlib.Path) -> str:
     for method in dict.fromkeys(row.label for row in found):
         line = [cells[method, task] for task in tasks]
         words = [
-            f"{x['reward']['mean']:,.4g} / {x['cost']['mean']:.3g}, {round(x['within'] * x['seeds'])} of {x['seeds']}"
+            f"{_number(x['reward']['mean'], ',.4g')} / {_number(x['cost']['mean'], '.3g')}, "
+            f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
             for x in line
         ]
         body.append([f"`{method}`", *words])
@@ -167,7 +168,7 @@ def as_ran(files: pathlib.Path) -> str:
     for name in files.stem.split("+"):
         found = load(files.with_stem(name))
         held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
-        kept = [cost <= run["cost_limit"] for run in held for cost in run["table"]["cost"]]
+        kept = [cost <= run["cost_limit"] for run in held for cost in _scores(run)["cost"]]
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
         line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
@@ -191,10 +192,16 @@ def as_pairs(file: pathlib.Path) -> str:
     return markdown(["", *(f"`{row.label}`" for row in found)], body)
 
 
-def _mean_std(*mean_and_std: float) -> str:
-    """As `mean ± std`; some report no standard deviation."""
+def _mean_std(*mean_and_std: float | None) -> str:
+    """As `mean ± std`; some report no standard deviation. "-" if a seed broke, which has no score."""
+    if mean_and_std[0] is None:
+        return "-"
     digits = 2 if abs(mean_and_std[0]) >= 1 else 4
     return " ± ".join(f"{x:,.{digits}f}" for x in mean_and_std)
+
+
+def _number(x: float | None, form: str) -> str:
+    return "-" if x is None else format(x, form)
 
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
@@ -204,9 +211,13 @@ def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
 
 def _row(run: Run) -> Row:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
-    scores = {column: np.array(seeds, float) for column, seeds in run["table"].items()}
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
-    return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], scores)
+    return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], _scores(run))
+
+
+def _scores(run: Run) -> dict[str, np.ndarray]:
+    """{column: [seeds]} of a stored run's table, nan where a seed broke."""
+    return {column: np.array(seeds, float) for column, seeds in run["table"].items()}
 
 
 def as_points(file: pathlib.Path) -> str:
@@ -215,11 +226,11 @@ def as_points(file: pathlib.Path) -> str:
     found.sort(key=lambda run: (run["task"], list(METHODS).index(run["method"])))
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
-    def cell(values: list[float]) -> str:
+    def cell(values: np.ndarray) -> str:
         low, high = mean_interval(values)
-        return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
+        return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(values).all() else "-"
 
-    body = [[run["task"], run.get("label", run["method"]), *(cell(run["table"][c]) for c in present)] for run in found]
+    body = [[run["task"], run.get("label", run["method"]), *(cell(_scores(run)[c]) for c in present)] for run in found]
     return markdown(("task", "method", *present), body)
 
 

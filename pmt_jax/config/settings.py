@@ -99,16 +99,16 @@ class Hyper:
     )
     lambda_init: float = constraint(0.78, "multiplier before the first update", NOT_NEGATIVE)
     lambda_lr: float = constraint(
-        0.1, "step of the multiplier per update, for an excess in cost per step", NOT_NEGATIVE
+        0.1, "step of the multiplier per update, for an excess of 1 in `lambda_unit`", NOT_NEGATIVE
     )
     lambda_kp: float = constraint(
         0.0,
-        "with lambda_rule = pid: weight of the excess (cost per step) that is added to the multiplier",
+        "with lambda_rule = pid: weight of the excess, in `lambda_unit`, that is added to the multiplier",
         NOT_NEGATIVE,
     )
     lambda_kd: float = constraint(
         0.0,
-        "with lambda_rule = pid: weight of the rise of the excess since the last update, added as well",
+        "with lambda_rule = pid: weight of its rise since the last update, added as well",
         NOT_NEGATIVE,
     )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
@@ -216,7 +216,8 @@ class Config(Hyper):
         "step",
         "unit of the excess that changes the multiplier: cost per step, or share of the limit, cut at 1, so that one "
         "lambda_lr fits all limits and horizons; relative: share of the limit less the margin, and the multiplier "
-        "changes in proportion to itself, so that it becomes large soon where a tight limit needs it",
+        "changes in proportion to itself, so that it becomes large soon where a tight limit needs it, down to a "
+        "hundredth of `lambda_init`",
     )
     lambda_rule: Literal["integral", "pid"] = constraint(
         "integral",

@@ -66,7 +66,7 @@ def evaluate(
     count = setup.vector.spec.num_costs
     names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
     costs = jnp.stack([metrics[name] for name in names], axis=-1)
-    within = is_within(costs, metrics["true_episode_cost"][:, None], felt)
+    within = is_within(costs, metrics["true_episode_cost"][:, None], felt, setup.vector.horizon)
     return metrics | {"within_limit": within.astype(costs.dtype)}
 
 

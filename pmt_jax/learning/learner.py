@@ -83,7 +83,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
             else None
         ),
         multiplier=jnp.full(heads, hyper.lambda_init * constrained),
-        episode_cost=jnp.full(heads, jnp.asarray(hyper.cost_limit)),
+        episode_cost=jnp.full(heads, lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin)),  # no excess yet
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
         rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
@@ -136,7 +136,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch),
-        "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper)),
+        "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper, setup.vector.horizon)),
         "lambda": weigh(multiplier).mean(),
         "cost_excess": cost_excess.mean(),
         "cost_beyond": jnp.maximum(episode_cost - jnp.asarray(hyper.cost_limit), 0.0).sum(-1).mean(),

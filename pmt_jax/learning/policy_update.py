@@ -17,6 +17,8 @@ from .optimise import fit, shuffled
 from .setup import Setup
 from .types import Batch, Hyper, Metrics, Params, PolicyRows, Tag, TrainState
 
+LOWEST = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
+
 
 def update_policies(
     setup: Setup,
@@ -30,7 +32,7 @@ def update_policies(
     """Updates every agent's policy, then its multipliers.
 
     Args:
-      rows: leaves [N, R, ...]; violation: [N, K] in cost per step.
+      rows: leaves [N, R, ...]; cost_excess: [N, K] in cost per step.
 
     Returns:
       actors, multipliers [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
@@ -169,8 +171,10 @@ def _update_multiplier(
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
     excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)
-    step = lagrangian.relative_update if setup.config.lambda_unit == "relative" else lagrangian.dual_update
-    return step(multiplier, excess, hyper.lambda_lr, hyper.lambda_max)
+    if setup.config.lambda_unit == "relative":
+        lowest = LOWEST * hyper.lambda_init
+        return lagrangian.relative_update(multiplier, excess, hyper.lambda_lr, lowest, hyper.lambda_max)
+    return lagrangian.dual_update(multiplier, excess, hyper.lambda_lr, hyper.lambda_max)
 
 
 def in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:

@@ -125,14 +125,17 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
     return jnp.sum(x * finished, (0, 1)) / finished.sum()  # 0 / 0 is nan
 
 
-def within_limit(batch: Batch, hyper: Hyper) -> jax.Array:
+def within_limit(batch: Batch, hyper: Hyper, horizon: int) -> jax.Array:
     """Whether an episode's cost up to a step is within its limit, [T, B] bool."""
-    return is_within(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper)
+    return is_within(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper, horizon)
 
 
-def is_within(felt: jax.Array, true: jax.Array, hyper: Hyper) -> jax.Array:
-    """Whether episode costs [..., K] are within their limits, [...] bool: the true one, of several each felt one."""
-    cost = felt if felt.shape[-1] > 1 else true * hyper.cost_seen
+def is_within(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) -> jax.Array:
+    """Whether episode costs [..., K] are within their limits, [...] bool: the true one, of several each felt one.
+
+    The limit is on what is felt, so a true cost counts as what it is expected to be felt as, see `Setup.limits`.
+    """
+    cost = felt if felt.shape[-1] > 1 else hyper.cost_seen * true + hyper.cost_false * (horizon - true)
     return jnp.all(cost <= jnp.asarray(hyper.cost_limit), axis=-1)
 
 
@@ -167,7 +170,7 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "episode_cost": finished_mean(batch, batch.episode_cost.sum(-1).mean(-1)),
         "episode_length": finished_mean(batch, batch.episode_length),
         "episodes": batch.finished.sum(),
-        "terminations": batch.terminated.sum(),
+        "terminations": (batch.terminated & batch.whole).sum(),
         "violation_rate": (cost.max(-1) > 0).mean(),
         "step_reward": batch.reward.mean(),
         "step_cost": cost.mean(),

@@ -241,11 +241,12 @@ def cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
     """The limit as a dashed line; linear up to it, logarithmic beyond if costs are many times as high."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
-    limits = sorted({group.true_limit if name.startswith("true") else group.cost_limit for group in shown})
+    limits = {group.true_limit if name.startswith("true") else group.cost_limit for group in shown}
+    limits = sorted(limit for limit in limits if math.isfinite(limit))
     for limit in limits:
         axis.axhline(limit, color=INK, ls="--", lw=1)
     top = max(np.nanmax(curve(group, name)[1], initial=0.0) for group in shown)
-    bend = max(limits) or 1.0
+    bend = max(limits, default=0.0) or 1.0
     if top > 4 * bend:
         ticks = cost_ticks(bend, top)
         axis.set_yscale("symlog", linthresh=bend)

@@ -40,7 +40,7 @@ class RunLog:
       steps: [P] environment steps of one seed, ascending.
       metrics: {name: [S, P]} the metrics that are numbers, nan where unknown.
       versions: what the numbers depend on besides the settings.
-      broken: seeds that stopped training before the end, which have no final metrics.
+      broken: {seed: step} of those that stopped training before the end, which have no final metrics.
     """
 
     folder: pathlib.Path
@@ -52,7 +52,7 @@ class RunLog:
     steps: np.ndarray
     metrics: dict[str, np.ndarray]
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
-    broken: tuple[int, ...] = ()
+    broken: dict[int, int] = dataclasses.field(default_factory=dict)
 
     @property
     def identity(self) -> str:
@@ -76,33 +76,37 @@ class RunLog:
         values = self._last(source)
         known = np.isfinite(values)
         mean = np.where(known, values, 0.0).sum(1) / np.maximum(known.sum(1), 1)
-        return np.where(known.any(1) & ~np.isin(self.seeds, self.broken), mean, np.nan)
+        return np.where(known.any(1) & ~np.isin(self.seeds, list(self.broken)), mean, np.nan)
 
     def throughout(self, name: str) -> np.ndarray | None:
         """[S] means of a metric over all steps of training, nan for a seed that broke; None if unknown."""
         if name not in self.metrics:
             return None
         mean = _averaged(self.metrics[name], [0])[:, 0]
-        return np.where(np.isin(self.seeds, self.broken), np.nan, mean)
+        return np.where(np.isin(self.seeds, list(self.broken)), np.nan, mean)
 
     @property
     def excess(self) -> np.ndarray:
         """[S] how far each seed's cost at the end (see `final`) is beyond the limit; of several costs the worst.
 
-        If not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs.
+        If not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones are
+        felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
         """
         several = sum(name.startswith("cost_limit/") for name in self.metrics)
         if several:
             limits = (np.nanmax(self.metrics[f"cost_limit/{k}"], axis=1) for k in range(several))
             costs = (self._final(f"episode_cost/{k}") for k in range(several))
             return np.max([cost - limit for cost, limit in zip(costs, limits, strict=True)], axis=0)
-        if self.settings.get("cost_seen", 1.0) < 1 and "true_episode_cost" in self.metrics:
+        missed, false = self.settings.get("cost_seen", 1.0) < 1, self.settings.get("cost_false", 0.0)
+        if missed and not false and "true_episode_cost" in self.metrics:
             return self._final("true_episode_cost") - self.true_limit
         return self._final("episode_cost") - self.cost_limit
 
     @property
     def true_limit(self) -> float:
-        """The limit on true costs, of which the team feels a share."""
+        """The limit on true costs, of which the team feels a share; nan if it feels false ones, too."""
+        if self.settings.get("cost_false", 0.0):
+            return math.nan  # depends on the time limit, which a run folder does not say
         return self.cost_limit / self.settings.get("cost_seen", 1.0)
 
     def _final(self, name: str) -> np.ndarray:
@@ -110,10 +114,17 @@ class RunLog:
         return np.full(len(self.seeds), np.nan) if found is None else found
 
     def until(self, step: int) -> RunLog:
-        """The same run as if it had ended after this step."""
+        """The same run as if it had ended after this step.
+
+        Raises:
+          UsageError: it has no metrics of so early a step.
+        """
         kept = self.steps <= step
+        if not kept.any():
+            raise UsageError(f"{self.folder} has no metrics up to step {step:,}: its first are of {self.steps[0]:,}")
         metrics = {name: values[:, kept] for name, values in self.metrics.items()}
-        return dataclasses.replace(self, steps=self.steps[kept], metrics=metrics)
+        broken = {seed: at for seed, at in self.broken.items() if at <= step}
+        return dataclasses.replace(self, steps=self.steps[kept], metrics=metrics, broken=broken)
 
     def thinned(self, points: int) -> RunLog:
         """The same run with its metrics averaged into at most so many points, over what is known in each."""
@@ -213,7 +224,7 @@ def read(folder: pathlib.Path) -> RunLog | None:
         steps=np.array(steps),
         metrics=_metrics(rows, seeds, steps, metrics),
         versions=_versions(folder),
-        broken=tuple(sorted({row["seed"] for row in rows if row.get("broken") is not None})),
+        broken={row["seed"]: row["step"] for row in reversed(rows) if row.get("broken") is not None},
     )
 
 

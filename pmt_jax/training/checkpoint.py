@@ -87,6 +87,11 @@ def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
         return dict(file)
 
 
+def has_checkpoint(folder: pathlib.Path) -> bool:
+    """Whether a run folder holds a checkpoint that was written to its end."""
+    return processes.by_first(lambda: any(path.name.isdigit() for path in (folder / "checkpoints").glob("*")))
+
+
 class Checkpoints:
     """The checkpoints of a run folder, named by their step; the newest `KEEP` are kept.
 

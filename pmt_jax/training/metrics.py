@@ -43,7 +43,7 @@ METRICS: dict[str, Metric] = {
     "episode_cost": Metric("cost", "the same of one agent's cost, mean over agents"),
     "episode_length": Metric("steps", "control steps of an episode, mean over the episodes that ended"),
     "episodes": Metric("", "episodes that ended", "sum"),
-    "terminations": Metric("", "episodes that ended by the task's rule, not by the time limit", "sum"),
+    "terminations": Metric("", "of these, by a rule of the task, as is the limit with `time_limit = terminate`", "sum"),
     "violation_rate": Metric("", "share of steps with a cost above 0 for some agent"),
     "within_limit": Metric(
         "", "share of the episodes that ended whose cost is within the limit, of several costs each"
@@ -71,7 +71,7 @@ METRICS: dict[str, Metric] = {
     "actor/share_of_step": Metric("", "share of an update's step that `kl_max` kept"),
     "actor/case": Metric("", "which case of the trust-region problem was solved"),
     "actor/reach": Metric("cost per step", "most that a step of the trust region promises to take off the cost"),
-    "actor/line_search_steps": Metric("", "steps of the line search that were tried"),
+    "actor/line_search_steps": Metric("", "steps of the line search that were tried in vain"),
     "fear/loss": Metric("", "loss of the fear network, in an update's last epoch"),
     "fear/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
     "fear/brier": Metric("", "mean squared error of fear against the costs of a batch not learned from yet"),

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from ..output import Say, dropped_if_closed
 
 CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SHOW_CURSOR = "\x1b[?25h"
 
 
 @contextlib.contextmanager
@@ -94,5 +95,7 @@ class Interrupts:
         self._say(f"interrupted: {what}")
         self._before_exit()
         with dropped_if_closed():
+            if sys.stdout.isatty():  # the live table has hidden the cursor
+                sys.stdout.write(SHOW_CURSOR)
             sys.stdout.flush()
         os._exit(128 + number)

@@ -23,7 +23,7 @@ from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
 from . import claims, health, jobs, processes, run_folder
-from .checkpoint import Checkpoints
+from .checkpoint import Checkpoints, has_checkpoint
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Logger, Profile, check_loggers, open_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
@@ -84,7 +84,7 @@ def train(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
-        begin = None if resume else warm_start(setup)
+        begin = None if resume and out and has_checkpoint(out) else warm_start(setup)
         out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say, change))
         _describe(setup, out, say)
         if cache:
@@ -278,8 +278,8 @@ class Trainer:
         gone = dict(self.broken)
         self._find_broken(rows, finite)
         if self.broken:
-            trains = np.array([i not in self.broken for i in range(self.config.seeds)])
-            state = self.programs.take(trains, self.state, state)
+            broken = np.array([i in self.broken for i in range(self.config.seeds)])
+            state = self.programs.take(broken, state, self.state)  # self.state stays whole: `train` may go back to it
         self.state = state
         for i, reason in self.broken.items():
             rows[i] = without_metrics(rows[i], reason) if i in gone else rows[i] | {"broken": reason}

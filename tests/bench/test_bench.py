@@ -414,6 +414,18 @@ def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
 
 
+def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
+    found = stored()["velocity_ant_2x4_h200"]
+    one = next(run for run in found if run["method"] == "mixed")
+    one["table"] = {column: [None, *scores[1:]] for column, scores in one["table"].items()}
+    file = tmp_path / "broken.json"
+    file.write_text(json.dumps(found))
+    assert runs.as_paper(file).splitlines()[-1] == "| mixed | - | - | 4 of 5 | - | - | - |"
+    assert "- / -, 4 of 5" in runs.as_summary(file)
+    assert "| 24 of 25 |" in runs.as_ran(file)
+    assert any("| mixed" in line and "| - | - | - |" in line for line in runs.as_points(file).splitlines())
+
+
 def test_only_a_multiplier_is_called_pid(tmp_path: pathlib.Path):
     """The setting is in the configuration of every method, also where nothing reads it."""
     made = []

@@ -158,12 +158,14 @@ def test_dual_update_is_projected():
     assert lagrangian.dual_update(jnp.asarray(19.9), -violation, 2.0, 20.0) == 20
 
 
-def test_a_relative_update_is_a_share_of_the_multiplier_and_never_reaches_zero():
+def test_a_relative_update_is_a_share_of_the_multiplier_within_its_bounds():
     multiplier = jnp.asarray([0.5, 4.0])
-    up, down = (lagrangian.relative_update(multiplier, jnp.asarray(x), 0.25, 20.0) for x in (1.0, -1.0))
+    up, down = (lagrangian.relative_update(multiplier, jnp.asarray(x), 0.25, 0.01, 20.0) for x in (1.0, -1.0))
     np.testing.assert_allclose(up / multiplier, np.exp(0.25), rtol=1e-6)
     np.testing.assert_allclose(up * down, multiplier**2, rtol=1e-6)  # as fast down as up
-    assert lagrangian.relative_update(jnp.asarray(19.9), jnp.asarray(1.0), 0.25, 20.0) == 20
+    for near, excess, bound in (19.9, 1.0, 20.0), (0.0101, -1.0, 0.01):
+        bounded = lagrangian.relative_update(jnp.asarray(near), jnp.asarray(excess), 0.25, 0.01, 20.0)
+        np.testing.assert_allclose(bounded, bound, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("cost", "share"), [(0, -1), (1.5, -0.25), (2, 0), (3, 0.5), (4, 1), (90, 1)])

@@ -252,11 +252,17 @@ def test_share_of_episodes_within_and_cost_beyond_the_limit():
     setup, _, batch = acted()
     cost = np.asarray(batch.true_episode_cost[-1, :, :, 0]).mean(-1)  # all episodes end with the batch
     for limit in np.median(cost), cost.max(), cost.min() - 1e-3:
-        share = rollout.finished_mean(batch, rollout.within_limit(batch, hyper_of(setup, limit)))
+        share = rollout.finished_mean(batch, rollout.within_limit(batch, hyper_of(setup, limit), 25))
         np.testing.assert_allclose(share, (cost <= np.float32(limit)).mean())
-    several = rollout.is_within(jnp.asarray([[1.0, 2.0], [3.0, 0.0]]), jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]))
+    several = rollout.is_within(
+        jnp.asarray([[1.0, 2.0], [3.0, 0.0]]), jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]), 25
+    )
     assert several.tolist() == [True, False]
-    assert rollout.is_within(jnp.ones((1, 1)), jnp.ones((1, 1)), hyper_of(setup, 0.5, cost_seen=0.5)).all()
+    assert rollout.is_within(jnp.ones((1, 1)), jnp.ones((1, 1)), hyper_of(setup, 0.5, cost_seen=0.5), 25).all()
+    felt = make_setup(load_config("lane", cost_seen=0.5, cost_false=0.1))  # a limit of 1 of 25 steps
+    true = jnp.asarray([[0.9], [1.1], [4.0]])
+    within = rollout.is_within(true, true, dataclasses.replace(felt.hyper, cost_limit=jnp.asarray(felt.limits)), 25)
+    assert within.tolist() == [True, False, False]
     made = program("mappo_l")
     start = made.init(made.setup.hyper, jax.random.key(0))
     for limit in 3.0, 30.0:
@@ -284,20 +290,21 @@ def test_figures_of_episodes_count_finished_ones_only():
 
 def test_spread_starts_end_as_many_episodes_in_every_rollout_and_count_whole_ones():
     """Ten environments and rollouts of 5 steps: an episode of 25 steps is five rollouts long."""
-    small = {"method": "mappo", "epochs": 1, "minibatches": 1}
+    small = {"method": "mappo", "epochs": 1, "minibatches": 1, "time_limit": "terminate"}
     setup = make_setup(load_config("lane", num_envs=10, rollout_length=5, episode_starts="spread", **small))
     state = jax.jit(lambda key: learner.init(setup, setup.hyper, key))(jax.random.key(0))
     step = jax.jit(lambda state: learner.train_step(setup, setup.hyper, state))
-    begun, counted, lengths = [], [], []
+    begun, counted, terminated, lengths = [], [], [], []
     for _ in range(10):
         before = state.rollout.vector.episode
         state, metrics = step(state)
         begun.append(int((state.rollout.vector.episode - before).sum()))
         counted.append(int(metrics["episodes"]))
+        terminated.append(int(metrics["terminations"]))
         lengths.append(float(metrics["episode_length"]))
     assert begun == [2] * 10
     # The first of environment 0 is whole; it ends in the fifth rollout. All that are cut have ended by then.
-    assert counted == [0] * 4 + [1] + [2] * 5
+    assert counted == terminated == [0] * 4 + [1] + [2] * 5
     assert np.isnan(lengths[:4]).all() and lengths[4:] == [25.0] * 6
 
 

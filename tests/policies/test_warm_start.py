@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+import shutil
 from typing import Any
 
 import chex
@@ -90,6 +91,19 @@ def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp
     assert cli("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)[0] == 0
     assert load_config(out / "config.toml").init == str(whole)
     assert rows(out)[0]["fear/loss"] != rows(whole)[0]["fear/loss"]
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
+    whole: pathlib.Path, tmp_path: pathlib.Path, cli
+):
+    out = tmp_path / "run"
+    words = ("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)
+    assert cli(*words)[0] == 0
+    before = rows(out)
+    shutil.rmtree(out / "checkpoints")
+    code, text, _ = cli(*words, "--resume")
+    assert code == 0 and "the run starts over" in text
+    assert [row | {"seconds": 0} for row in rows(out)] == [row | {"seconds": 0} for row in before]
 
 
 @pytest.mark.parametrize(

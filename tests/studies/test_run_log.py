@@ -30,12 +30,18 @@ def test_a_run_can_be_read_as_if_it_had_ended_earlier(tmp_path: pathlib.Path):
     assert early.steps[-1] == 500
     np.testing.assert_allclose(early.final("episode_reward"), [np.mean(range(451, 501))])
     np.testing.assert_array_equal(log.until(1000).metrics["episode_reward"], log.metrics["episode_reward"])
+    with pytest.raises(UsageError, match="no metrics up to step 0: its first are of 1"):
+        log.until(0)
+    lines = [row(step, seed, 1.0, broken="nan" if seed == step > 1 else None) for step in (1, 2, 3) for seed in (2, 3)]
+    log = run_log.read(written(tmp_path / "b", lines))
+    for step, finals in ((1, [1, 1]), (2, [np.nan, 1]), (3, [np.nan, np.nan])):
+        np.testing.assert_array_equal(log.until(step).final("episode_reward"), finals)
 
 
 def test_the_final_metrics_of_a_seed_that_broke_are_unknown(tmp_path: pathlib.Path):
     both = [row(10, 0, 1.0, broken=None), row(10, 1, 1.0, broken="critic/loss is nan")]
     log = run_log.read(written(tmp_path / "a", both))
-    assert log.broken == (1,)
+    assert log.broken == {1: 10}
     np.testing.assert_array_equal(log.final("episode_reward"), [1, np.nan])
 
 

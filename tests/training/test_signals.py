@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import pathlib
 import shlex
 import signal
@@ -10,6 +12,7 @@ import sys
 
 import pytest
 
+from pmt_jax.training import signals
 from runs import ARGUMENTS, STEPS, assert_same_run, environment
 
 BUSY = """
@@ -69,6 +72,16 @@ def test_ctrl_c_twice_in_a_long_chunk_ends_the_run_at_once(tmp_path: pathlib.Pat
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 130 and text == "interrupted: what was not saved is lost\n"
     assert not (tmp_path / ".claim").exists()
+
+
+def test_a_run_that_ends_at_once_gives_the_terminal_its_cursor_back(monkeypatch: pytest.MonkeyPatch):
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setattr(os, "_exit", lambda code: terminal.write(f" exit {code}"))
+    interrupts = signals.Interrupts(lambda text: terminal.write(text), lambda: None)
+    interrupts._answer(signal.SIGINT, at_once=True)
+    assert terminal.getvalue() == "interrupted: nothing new was trained yet\x1b[?25h exit 130"
 
 
 @pytest.mark.full

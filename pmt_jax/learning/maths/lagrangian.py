@@ -59,17 +59,19 @@ def relative_update(
     multiplier: jax.Array,
     excess: jax.Array,
     lambda_lr: jax.Array | float,
+    lambda_min: jax.Array | float,
     lambda_max: jax.Array | float,
 ) -> jax.Array:
-    """One step in proportion to the multiplier: lambda <- min(lambda exp(alpha x), lambda_max).
+    """One step in proportion to the multiplier: lambda <- clip(lambda exp(alpha x), lambda_min, lambda_max).
 
     An exponentiated gradient (Kivinen and Warmuth, 1997). A multiplier doubles in the same time whatever its size, so
-    one rate serves limits whose multipliers differ by a factor of ten.
+    one rate serves limits whose multipliers differ by a factor of ten. Without the lower bound a long time without
+    costs would take as long to undo, and in the end 0 would never move again.
 
     Args:
       multiplier: [...], lambda > 0; excess: [...], x, `in_limits`.
     """
-    return jnp.minimum(multiplier * jnp.exp(lambda_lr * excess), lambda_max)
+    return jnp.clip(multiplier * jnp.exp(lambda_lr * excess), lambda_min, lambda_max)
 
 
 def lowered_limit(
