@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -97,12 +98,15 @@ def task_options(name: str) -> dict[str, Any]:
 
 
 def explain_options(name: str) -> str:
-    """The arguments in a task's docstring; '' if it has none.
+    """What a task's docstring says of its options; '' if it has none.
 
     Raises:
       TaskError: unknown name.
     """
-    return textwrap.dedent((inspect.getdoc(_class(name)[0]) or "").partition("Args:\n")[2])
+    cls, fixed = _class(name)
+    arguments = textwrap.dedent((inspect.getdoc(cls) or "").partition("Args:\n")[2])
+    entries = re.split(r"\n(?=\S)", arguments)
+    return "\n".join(entry for entry in entries if entry.partition(":")[0] not in fixed)
 
 
 def _class(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:

@@ -58,6 +58,7 @@ def typed(init: Callable[..., None]) -> Callable[..., None]:
 
 
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", types.NoneType: "none"}
+_WORDS |= {tuple: "a list in brackets"}
 
 
 def _kinds(hint: Any) -> list[type]:

@@ -64,7 +64,9 @@ def _add_table(commands: Any) -> None:
         help="also print p values against the baseline: Mann-Whitney U, Holm's correction",
     )
     add_format(table)
-    table.add_argument("-o", dest="output", type=pathlib.Path, metavar="FILE", help="also write the table to this file")
+    table.add_argument(
+        "-o", dest="output", type=pathlib.Path, metavar="FILE", help="write the table to this file instead"
+    )
 
 
 def _add_compare(commands: Any) -> None:

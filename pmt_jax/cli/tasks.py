@@ -7,6 +7,7 @@ from typing import Any
 
 from .. import tasks
 from ..config import toml
+from ..config.settings import load_config
 from ..output import say
 from .parser import command, limits
 from .process import at_once
@@ -45,7 +46,7 @@ def _describe(name: str) -> int:
     say(f"{name}: {toml.about(name) or 'a task of your own'}")
     for what, text in facts.items():
         say(f"  {what:12} {text}")
-    options = tasks.options(name)
+    options = tasks.options(name) | (dict(load_config(name).env) if name in toml.names() else {})
     say("  options      --env NAME=VALUE, by default " + ", ".join(f"{k}={v}" for k, v in options.items()))
     for line in tasks.explain_options(name).splitlines():
         say(f"    {line}")

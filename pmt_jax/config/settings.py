@@ -299,7 +299,12 @@ class Config(Hyper):
 
 def differences(old: Config, new: Config) -> dict[str, str]:
     """{field: 'old -> new'} of the settings that are not the same; a nan is the same as a nan."""
-    pairs = {f.name: (repr(getattr(old, f.name)), repr(getattr(new, f.name))) for f in dataclasses.fields(Config)}
+
+    def shown(config: Config, name: str) -> str:
+        value = getattr(config, name)
+        return ", ".join(f"{option}={x}" for option, x in value) or "none" if name == "env" else repr(value)
+
+    pairs = {f.name: (shown(old, f.name), shown(new, f.name)) for f in dataclasses.fields(Config)}
     return {name: f"{a} -> {b}" for name, (a, b) in pairs.items() if a != b}
 
 

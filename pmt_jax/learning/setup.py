@@ -133,6 +133,5 @@ def _options(config: Config) -> dict[str, Any]:
 def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:
     count, given = spec.num_costs, np.size(config.cost_limit)
     if given not in (1, count):
-        raise UsageError(
-            f"cost_limit has {given} numbers, but task '{spec.name}' has {count} cost(s); give one number, or {count}"
-        )
+        wanted = "one number" if count == 1 else f"one number, or {count}"
+        raise UsageError(f"cost_limit has {given} numbers, but task '{spec.name}' has {count} cost(s); give {wanted}")

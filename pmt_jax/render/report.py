@@ -122,7 +122,7 @@ def _summary(log: RunLog) -> str:
     took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
     return (
         f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "
-        f"limit on an episode's cost {log.cost_limit:g}."
+        f"limit on an episode's cost {' + '.join(f'{x:g}' for x in log.limits)}."
     )
 
 
@@ -140,7 +140,7 @@ def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
     results = [(kind, row) for kind in kinds for row in found[kind]]
     first = results[0][1]
     main = [name for name in ("episode_reward", "episode_cost", "within_limit", "violation_rate") if name in first]
-    others = [name for name, x in first.items() if isinstance(x, tuple) and name not in main]
+    others = [name for name, x in first.items() if isinstance(x, tuple) and name not in (*main, "cost_limit")]
 
     def listing(names: Sequence[str]) -> str:
         cells = (

@@ -50,7 +50,7 @@ def compare(first: pathlib.Path, second: pathlib.Path, picture: pathlib.Path | N
     head += ["difference", "P"]
     reward, cost = compared([ours, theirs])
     body = [_line(reward, ours.score(reward), theirs.score(reward), 1)]
-    body += [_line(f"{cost} (limit {_both(ours, theirs)})", ours.score(cost), theirs.score(cost), -1)]
+    body += [_line(f"{cost} (limit {_both(ours, theirs, cost)})", ours.score(cost), theirs.score(cost), -1)]
     body += [_within(ours.beyond, theirs.beyond)]
     return formats.write(head, body, "text", NOTES)
 
@@ -72,8 +72,8 @@ def _names(ours: Row, theirs: Row, first: pathlib.Path, second: pathlib.Path) ->
     return [f"{ours.method} {path}" for path in (first, second)]
 
 
-def _both(ours: Row, theirs: Row) -> str:
-    limits = dict.fromkeys(f"{row.cost_limit:g}" for row in (ours, theirs))
+def _both(ours: Row, theirs: Row, cost: str) -> str:
+    limits = dict.fromkeys(row.limit_on(cost) for row in (ours, theirs))
     return " and ".join(limits)
 
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..config import toml
-from ..config.settings import FIELDS, Config, load_config
+from ..config.settings import FIELDS, Config, convert, load_config
 from ..errors import UsageError
 from ..tasks import did_you_mean
 
@@ -67,10 +67,11 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
     """Every point by name: `fear_l2=0,lambda_lr=0.1`, after `draw=3` if drawn, after `task=lane` if there are several.
 
     Args:
-      preset, fixed: as for `load_config`, for all points.
+      preset, fixed: as for `load_config`, for all points. Options in a fixed `env` are laid beside those that vary.
 
     Raises:
-      UsageError: an unknown setting, a value that does not fit, ranges without draws, or two points of one name.
+      UsageError: an unknown setting, a value that does not fit, ranges without draws, a setting that varies and is
+        fixed, two points of one name, or two that would train the same seed.
     """
     named = [point for part in parts for point in _points(part, preset, fixed)]
     several = len({config.task for _, config in named}) > 1
@@ -80,27 +81,56 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
         if repr(points.get(name, config)) != repr(config):
             raise UsageError(f"two points have the name '{name}': add the setting in which they differ to `set`")
         points[name] = config
+    _check_seeds(points)
     return points
+
+
+def _check_seeds(points: Points) -> None:
+    """Raises UsageError if two points that differ in their first seed alone have a seed in common."""
+    alike: dict[str, list[tuple[int, str]]] = {}
+    for name, config in points.items():
+        alike.setdefault(repr(config.replace(seed=0)), []).append((config.seed, name))
+    for found in alike.values():
+        for (seed, name), (after, other) in itertools.pairwise(sorted(found)):
+            if seed < after < seed + points[name].seeds:
+                raise UsageError(
+                    f"points '{name}' and '{other}' would both train seed {after}: with seeds = {points[name].seeds} "
+                    "their first seeds must be as far apart, or ask for fewer seeds"
+                )
 
 
 def _points(part: Part, preset: str, fixed: Mapping[str, Any]) -> list[tuple[list[str], Config]]:
     """The points of a part, each with the words of its name."""
-    _check(part)
+    _check(part, fixed)
     rng = np.random.default_rng(part.seed)
     draws = [{k: r.draw(rng, FIELDS[k] is int) for k, r in part.ranges.items()} for _ in range(part.draws)]
     found = []
+    values = {name: list(map(_table, x)) if name == "env" else x for name, x in part.values.items()}
     for number, draw in enumerate(draws or [{}]):
-        for chosen in itertools.product(*part.values.values()):
-            varied = dict(zip(part.values, chosen, strict=True))
+        for chosen in itertools.product(*values.values()):
+            varied = dict(zip(values, chosen, strict=True))
             words = [f"draw={number}"] * bool(draws) + [f"{k}={_word(v)}" for k, v in varied.items()]
-            if isinstance(varied.get("env"), str):
-                varied["env"] = [varied["env"]]
-            found.append((words, load_config(part.source, preset=preset, **{**varied, **draw, **fixed})))
+            if "env" in varied:
+                varied["env"] = _beside(varied["env"], _table(fixed.get("env", ())))
+            found.append((words, load_config(part.source, preset=preset, **{**fixed, **varied, **draw})))
     return found
 
 
-def _check(part: Part) -> None:
+def _table(env: Any) -> dict[str, Any]:
+    """A task's options {name: value}, from a table or from NAME=VALUE."""
+    return dict(convert("env", [env] if isinstance(env, str) else env))
+
+
+def _beside(varied: dict[str, Any], fixed: dict[str, Any]) -> dict[str, Any]:
+    for name in varied.keys() & fixed.keys():
+        raise UsageError(f"the option {name} varies and is given by itself; leave one of the two out")
+    return fixed | varied
+
+
+def _check(part: Part, fixed: Mapping[str, Any]) -> None:
     for name in (*part.values, *part.ranges):
+        if name in fixed and name != "env":
+            raise UsageError(f"{name} varies and is given by itself; leave one of the two out")
         if name not in FIELDS:
             raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
         if name == "task":
@@ -118,8 +148,10 @@ def _word(value: Any) -> str:
     """A value in the form that a folder's name has: a number the same however it was written."""
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, dict):
+        return ",".join(f"{name}={_word(x)}" for name, x in value.items())
     if isinstance(value, list | tuple):
-        return ",".join(map(_word, value))
+        return ("+" if any(isinstance(x, list | tuple) for x in value) else ",").join(map(_word, value))
     try:
         return f"{float(value):.12g}"
     except (ValueError, TypeError):
@@ -155,8 +187,15 @@ def from_words(source: Source, words: Sequence[str], draws: int = 0, seed: int =
         if found := _range(text):
             ranges[name] = found
         else:
-            values[name] = [part.strip("[]") for part in re.findall(r"\[[^\]]*\]|[^,]+", text)]
+            values[name] = [part[1:-1] if part[0] + part[-1] == "[]" else part for part in _split(text)]
     return Part(source, values, ranges, draws, seed)
+
+
+def _split(text: str) -> list[str]:
+    """The parts between commas that are in no brackets."""
+    depths = itertools.accumulate((letter == "[") - (letter == "]") for letter in text)
+    cut = "".join("\0" if letter == "," and not depth else letter for letter, depth in zip(text, depths, strict=True))
+    return [part for part in cut.split("\0") if part]
 
 
 def _range(text: Any) -> Range | None:

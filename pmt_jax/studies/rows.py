@@ -78,6 +78,8 @@ class Row:
       source: `evaluation` or `training`, what the scores are taken from.
       scores: {column: [seeds]} in the task's units; nan if a seed has none.
       excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` if None.
+      limits: of each cost; the one if empty.
+      true_limit: on true costs; nan if unknown.
     """
 
     task: str
@@ -88,6 +90,8 @@ class Row:
     source: str
     scores: dict[str, np.ndarray]
     excess: np.ndarray | None = None
+    limits: tuple[float, ...] = ()
+    true_limit: float = math.nan
 
     def score(self, column: str) -> np.ndarray:
         """[seeds] of a column, nan if the row does not have it."""
@@ -98,6 +102,12 @@ class Row:
     def beyond(self) -> np.ndarray:
         """[seeds] cost beyond the limit, of several costs the worst; below 0 within it."""
         return self.score("cost") - self.cost_limit if self.excess is None else self.excess
+
+    def limit_on(self, column: str) -> str:
+        """The limit on the costs of a column; of several costs each, which are added as the costs are."""
+        if column == "true cost" and math.isfinite(self.true_limit):
+            return f"{self.true_limit:g}"
+        return " + ".join(f"{x:g}" for x in self.limits or (self.cost_limit,))
 
     @property
     def label(self) -> str:
@@ -147,6 +157,8 @@ def _row(group: Group) -> Row:
         source="evaluation" if first.evaluated else "training",
         scores={name: x for name, x in scores.items() if x is not None},
         excess=np.concatenate([run.excess for run in group.runs]),
+        limits=first.limits,
+        true_limit=group.true_limit,
     )
 
 

@@ -87,20 +87,25 @@ class RunLog:
 
     @property
     def excess(self) -> np.ndarray:
-        """[S] how far each seed's cost at the end (see `final`) is beyond the limit; of several costs the worst.
+        """[S] how far each seed's cost at the end (see `final`) is beyond its limit; of several the worst as felt.
 
-        If not all costs are felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones are
-        felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
+        If not all of one cost is felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones
+        are felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
         """
-        several = sum(name.startswith("cost_limit/") for name in self.metrics)
-        if several:
-            limits = (np.nanmax(self.metrics[f"cost_limit/{k}"], axis=1) for k in range(several))
-            costs = (self._final(f"episode_cost/{k}") for k in range(several))
-            return np.max([cost - limit for cost, limit in zip(costs, limits, strict=True)], axis=0)
+        if len(self.limits) > 1:
+            costs = (self._final(f"episode_cost/{k}") for k in range(len(self.limits)))
+            return np.max([cost - limit for cost, limit in zip(costs, self.limits, strict=True)], axis=0)
         missed, false = self.settings.get("cost_seen", 1.0) < 1, self.settings.get("cost_false", 0.0)
         if missed and not false and "true_episode_cost" in self.metrics:
             return self._final("true_episode_cost") - self.true_limit
         return self._final("episode_cost") - self.cost_limit
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Of each cost; the costs and their limits are added in `cost_limit`."""
+        several = sum(name.startswith("cost_limit/") for name in self.metrics)
+        each = [float(np.nanmax(self.metrics[f"cost_limit/{k}"])) for k in range(several)]
+        return tuple(each) or (self.cost_limit,)
 
     @property
     def true_limit(self) -> float:
@@ -219,13 +224,21 @@ def read(folder: pathlib.Path) -> RunLog | None:
         task=last["task"],
         method=last["method"],
         cost_limit=last["cost_limit"],
-        settings=flat(load_config(folder / "config.toml")) | _changes(folder),
+        settings=flat(_config(folder / "config.toml")) | _changes(folder),
         seeds=tuple(seeds),
         steps=np.array(steps),
         metrics=_metrics(rows, seeds, steps, metrics),
         versions=_versions(folder),
         broken={row["seed"]: row["step"] for row in reversed(rows) if row.get("broken") is not None},
     )
+
+
+def _config(file: pathlib.Path) -> Config:
+    """The settings of a run; a mistake in them is said with the file's name, as a table may read many."""
+    try:
+        return load_config(file)
+    except UsageError as error:
+        raise UsageError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
 
 
 def _check(row: dict[str, Any], file: pathlib.Path) -> None:
@@ -260,8 +273,13 @@ def _metrics(
 
 def _changes(folder: pathlib.Path) -> dict[str, str]:
     """Which settings changed after which step (--change), as one more setting; {} if none did."""
-    rows = read_rows(folder / "changes.jsonl")
-    told = [f"{name} {x} at {row['step']:,}" for row in rows for name, x in row["changed"].items()]
+    file = folder / "changes.jsonl"
+    try:
+        told = [f"{name} {x} at {row['step']:,}" for row in read_rows(file) for name, x in row["changed"].items()]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise UsageError(
+            f"{file}: a line is not of the form that --resume --change writes; mend or remove it"
+        ) from None
     return {"changed": "; ".join(told)} if told else {}
 
 
@@ -378,5 +396,5 @@ def _differing(run: RunLog, others: Iterable[RunLog]) -> str:
 def plain(value: Any) -> str:
     """A setting's value, numbers as short as they can be."""
     if isinstance(value, tuple):
-        return ",".join(map(plain, value))
+        return ("|" if any(isinstance(x, tuple) for x in value) else ",").join(map(plain, value))
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -62,7 +62,7 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
             launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
             with writing(out / "draws.json") as partial:
                 partial.write_text(json.dumps(values, indent=1) + "\n")
-        code = train_programs(wanted, launch)
+        code = _train_checked(wanted, launch)
     if code == 0:
         launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
         found = rows(read_all([out / name for name in points]))
@@ -79,10 +79,19 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
       The exit code of `trainer.train`: 0 when all points are finished.
 
     Raises:
-      UsageError: `out` holds a point of the same name with other settings.
+      UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
     """
     with claim(out):
-        return train_programs(missing_programs(points, out, launch.say), launch)
+        return _train_checked(missing_programs(points, out, launch.say), launch)
+
+
+def _train_checked(programs: Sequence[Program], launch: Launch) -> int:
+    """As `train_programs`, but a task or an option that does not exist shows now, not after the programs before it."""
+    first = [next(iter(program.points.values())) for program in programs]
+    for config in {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in first}.values():
+        if len(programs) > 1:
+            make_setup(config)
+    return train_programs(programs, launch)
 
 
 @dataclasses.dataclass(frozen=True)

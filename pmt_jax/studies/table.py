@@ -122,7 +122,7 @@ def _cells(
         within = f"{round(row['within'] * row['seeds'])}/{row['seeds']}"
         line = [row["task"], f"{row['method']} {row['settings']}".strip(), str(row["seeds"]), f"{row['steps']:,}"]
         line += [_interval(row.get(column), "iqm") for column in columns]
-        line += [f"{row['cost_limit']:g}", within, _number(row["worst"])]
+        line += [table[i].limit_on(compared(table)[1]), within, _number(row["worst"])]
         line += [_interval((row["better"] or {}).get(name), "probability") for name in better]
         line += [_number((row["p"] or {}).get(name), ".2g") for name in better if test]
         given = (reported[who][i].get(column) for who, column in papers)
@@ -149,7 +149,9 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
     notes = [
         f"A seed's score is its mean over the last tenth of its steps, of {used}.",
         "; ".join(column.note for column in shown(table) if column.note) + ".",
-        "limit: the cost allowed; seeds within: seeds whose cost is within it; worst seed: the highest cost of a seed.",
+        "limit: the cost allowed; seeds within: seeds whose cost is within it; worst seed: the highest cost of a seed."
+        + " Of several costs, which are added, each must be within its own limit."
+        * any(len(r.limits) > 1 for r in table),
         "Interquartile mean over seeds [95 % studentised interval]; -: unknown, or not finite for some seed; [-]: one "
         "seed has no interval.",
     ]
@@ -160,11 +162,16 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
     tables = sorted({f"{row['task']}: {row['paper']['table']}" for row in data if row["paper"]["table"]})
     if tables:
         notes.append(f"paper: mean ± standard deviation of 5 seeds, as far as known here ({', '.join(tables)}).")
-    notes += [f"{row['task']}, paper: {source}." for source, row in _sources(data).items()]
+    notes += [f"{', '.join(tasks)}, paper: {source}." for source, tasks in _sources(data).items()]
     return notes
 
 
-def _sources(data: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The sources of reported values that are not the paper's own, each with the first row of a task that has it."""
-    rows = [row for row in data if row["paper"]["source"]]
-    return {row["paper"]["source"]: row for row in reversed(rows)}
+def _sources(data: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
+    """The sources of reported values that are not the paper's own, each with the tasks of its rows."""
+    tasks: dict[str, list[str]] = {}
+    for row in data:
+        reported = row["paper"]
+        if reported["source"] and {"reward", "cost"} & {*reported, *reported["rerun"]}:
+            known = tasks.setdefault(reported["source"], [])
+            known += [row["task"]] * (row["task"] not in known)
+    return tasks

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 
 from ..output import dropped_if_closed
-from .metrics import Row
+from .metrics import Row, limits
 
 HISTORY = 12  # rows of the live table
 GAP = 2  # characters between its columns
@@ -68,7 +68,7 @@ class Progress:
             f"{step:,}",
             self._number("episode_reward", ".1f"),
             self._number("episode_cost", ".2f"),
-            ", ".join(f"{limit:g}" for limit in dict.fromkeys(row["cost_limit"] for row in rows)),
+            ", ".join(dict.fromkeys(limits(row) for row in rows)),
             self._number("violation_rate", ".2%"),
             self._number("lambda", ".3f"),
             f"{steps_per_second:,.0f}",

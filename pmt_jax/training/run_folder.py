@@ -104,8 +104,8 @@ def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> No
 def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
     """Refuses another engine, which computes another run; says which versions changed, which costs the last bits."""
     try:
-        old = json.loads((out / "versions.json").read_text())
-    except (OSError, ValueError):
+        old = dict(json.loads((out / "versions.json").read_text()))
+    except (OSError, ValueError, TypeError):
         say(f"{out / 'versions.json'} cannot be read: the engine and the versions of the run are unknown")
         return
     new = versions(setup)

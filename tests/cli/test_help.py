@@ -62,6 +62,8 @@ def test_envs_lists_and_describes(cli):
     ):
         assert words in out
     assert "unknown task 'lan'; did you mean 'lane'?" in cli("envs", "lan")[2]
+    swimmer = cli("envs", "velocity_swimmer_2x1")[1]  # what its configuration asks for, and no fixed option
+    assert "observation=raw" in swimmer and "threshold: " in swimmer and "variant" not in swimmer
 
 
 def test_one_episode_has_no_interval_and_long_names_keep_columns(capsys):

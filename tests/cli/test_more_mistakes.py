@@ -122,6 +122,11 @@ sweep lane --set =1 --out s | unknown setting ''
 sweep lane --set out=a,b --out s | unknown setting 'out'
 sweep lane --set clip=0.1 --set clip=0.2 --out s | --set names clip twice: give all its values at once
 sweep lane --set hidden=[64,32 --out s | --set takes NAME=VALUE,VALUE,..., or with --random
+sweep lane --set clip=0.1,0.2 --clip 0.3 --out s | clip varies and is given by itself; leave one of the two out
+sweep lane --set method=happo,mappo --method macpo --out s | method varies and is given by itself
+sweep lane --set env=num_agents=2,num_agents=3 --env num_agents=4 --out s | the option num_agents varies and is given by
+sweep lane --set seed=0,1 --seeds 2 --out s | 'seed=0' and 'seed=1' would both train seed 1: with seeds = 2 their first
+sweep lane --set env=num_agents=2,agents=3 --out s | task 'lane' has no option 'agents'
 sweep lane --set clip=0.1,0.2 --out file | cannot write into file: File exists; choose another --out
 sweep lane --set clip=a:b --random 2 --out s | random draws need a range
 sweep lane --set clip=0.1,0.2 --jobs 0 --out s | --jobs must be a whole number of at least 1, not '0'

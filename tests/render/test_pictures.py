@@ -269,6 +269,19 @@ def test_a_report_tells_all_there_is(pages: pathlib.Path, whole: pathlib.Path):
     assert not re.search(r'(?:src|href)="(?!data:|#)|@import|url\((?!#)', text)  # nothing that lies elsewhere
 
 
+def test_limits_of_several_costs_are_no_metric_of_a_report(monkeypatch: pytest.MonkeyPatch):
+    result = {
+        "seed": 0,
+        "step": 1,
+        "cost_limit": (1.0, 2.0, 3.0),
+        "episode_reward": (1.0, 0.5),
+        "info/speed": (2.0, 0.1),
+    }
+    monkeypatch.setattr(report.evaluate, "evaluate_run", lambda *_: [result])
+    text = "".join(report._evaluation(pathlib.Path("x"), 2))
+    assert "1.00 ± 0.50" in text and "2.00 ± 0.10" in text and "limit" not in text
+
+
 def test_what_a_run_lacks_is_told_in_its_place(tmp_path: pathlib.Path):
     half = written(tmp_path / "half", [row(10, 0, 1.0)])
     report.report([half], tmp_path / "report.html", say=lambda _: None)

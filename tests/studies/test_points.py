@@ -130,6 +130,15 @@ def test_a_file_of_a_sweep_is_no_run(tmp_path: pathlib.Path, cli):
     assert "leave out --set and --random" in cli("sweep", tmp_path / "study.toml", "--set", "clip=1", "--out", "x")[2]
 
 
+def test_options_that_are_given_lie_beside_those_that_vary():
+    words = ["env=partition=[[0,1],[2]],partition=[[0],[1,2]]"]
+    found = points.make_points([points.from_words("velocity_hopper_3x1", words)], env=["cost=excess"])
+    assert list(found) == ["env=partition=0,1+2", "env=partition=0+1,2"]
+    options = [dict(config.env) for config in found.values()]
+    assert [x["partition"] for x in options] == [((0, 1), (2,)), ((0,), (1, 2))]
+    assert all(x["cost"] == "excess" and x["observation"] == "raw" for x in options)
+
+
 def test_one_value_is_one_point():
     assert list(points.make_points([points.Part("lane", {"env": ["num_agents=3"]})])) == ["env=num_agents=3"]
     with pytest.raises(UsageError, match="does not fit"):

@@ -48,6 +48,32 @@ def test_a_table_says_how_the_limit_was_kept(tmp_path: pathlib.Path, cli):
     assert (data["within"], data["worst"]) == (0.5, 1.5)
 
 
+def test_limits_are_those_of_the_costs_beside_them(tmp_path: pathlib.Path, cli):
+    """Each of several; on true costs where not all are felt."""
+    each = {"cost_limit": 25.1, "cost_limit/0": 25.0, "cost_limit/1": 0.1, "episode_cost": 3.0}
+    each |= {"episode_cost/0": 2.0, "episode_cost/1": 1.0}
+    written(tmp_path / "two", [row(100, 0, 1.0, **each)])
+    text = cli("table", tmp_path / "two")[1]
+    assert "  25 + 0.1  0/1  " in text and "each must be within its own limit" in text
+    seen = {"cost_limit": 0.3, "episode_cost": 0.24, "true_episode_cost": 0.8}
+    written(tmp_path / "seen", [row(100, 0, 1.0, **seen)], 'task = "lane"\ncost_seen = 0.3\n')
+    line = cli("table", tmp_path / "seen")[1].splitlines()[2]
+    assert line.split()[-3:] == ["1", "1/1", "0.8"]
+    made(tmp_path / "all", "lane", "happo", {0: [1, 0.5]}, true_episode_cost=0.5)
+    assert "true cost (limit 1)" in cli("compare", tmp_path / "seen", tmp_path / "all")[1]
+
+
+def test_a_mistake_in_one_of_many_runs_names_its_file(tmp_path: pathlib.Path, cli):
+    made(tmp_path / "good", "lane", "happo", {0: [1, 1]})
+    bad = written(tmp_path / "bad", [row(100, 0, 1.0)], 'task = "lane"\nclipp = 1\n')
+    code, _, err = cli("table", tmp_path)
+    assert code == 2 and f"{bad / 'config.toml'}: unknown setting 'clipp'" in err
+    (bad / "config.toml").write_text('task = "lane"\n')
+    (bad / "changes.jsonl").write_text('{"step": "x", "changed": [1]}\n')
+    code, _, err = cli("table", tmp_path)
+    assert code == 2 and f"{bad / 'changes.jsonl'}: a line is not of the form" in err
+
+
 def test_a_table_says_who_left_the_corridor(tmp_path: pathlib.Path, cli):
     made(tmp_path / "a", "ant_2x4", "happo", {0: [1, 1]}, **{"info/outside": 0.5})
     made(tmp_path / "b", "lane", "happo", {0: [1, 1]})
@@ -113,7 +139,11 @@ def test_reported_figures_of_others_come_with_their_provenance(tmp_path: pathlib
     ant, cheetah, swimmer = text.splitlines()[2:5]
     assert ant.split()[-4:] == ["1099.23", "3.39", "798.00", "10.50"]
     assert cheetah.split()[-4:] == ["-", "-", "1141.00", "0.00"] and swimmer.split()[-4:] == ["-"] * 4
-    assert "rerun reward" in text and "velocity_ant_2x4, paper: second hand" in text and "not verified." in text
+    assert (
+        "rerun reward" in text
+        and "velocity_ant_2x4, velocity_half_cheetah_2x3, paper: second hand" in text
+        and "not verified." in text
+    )
 
 
 def test_improvement_over_all_tasks_weighs_tasks_alike(tmp_path: pathlib.Path, cli):

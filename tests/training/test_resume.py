@@ -131,10 +131,10 @@ def test_a_damaged_checkpoint_is_noticed_and_the_one_before_taken(whole: pathlib
 
 
 def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
-    """Without checkpoints and versions.json the run starts over, and what it had logged is kept."""
+    """Without checkpoints and with a damaged versions.json the run starts over, and what it had logged is kept."""
     before = (copy / "metrics.jsonl").read_text()
     shutil.rmtree(copy / "checkpoints")
-    (copy / "versions.json").unlink()
+    (copy / "versions.json").write_text("[1]")
     code, _, err = cli("eval", copy)
     assert code == 2 and "there is no finished checkpoint" in err
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
