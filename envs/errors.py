@@ -57,8 +57,14 @@ def typed(init: Callable[..., None]) -> Callable[..., None]:
     return checked
 
 
-_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", types.NoneType: "none"}
-_WORDS |= {tuple: "a list in brackets"}
+_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    tuple: "a list in brackets",
+    types.NoneType: "none",
+}
 
 
 def _kinds(hint: Any) -> list[type]:

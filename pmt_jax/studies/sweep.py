@@ -88,8 +88,8 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
 def _train_checked(programs: Sequence[Program], launch: Launch) -> int:
     """As `train_programs`, but a task or an option that does not exist shows now, not after the programs before it."""
     first = [next(iter(program.points.values())) for program in programs]
-    for config in {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in first}.values():
-        if len(programs) > 1:
+    if len(programs) > 1:
+        for config in {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in first}.values():
             make_setup(config)
     return train_programs(programs, launch)
 

@@ -43,7 +43,7 @@ METRICS: dict[str, Metric] = {
     "episode_cost": Metric("cost", "the same of one agent's cost, mean over agents"),
     "episode_length": Metric("steps", "control steps of an episode, mean over the episodes that ended"),
     "episodes": Metric("", "episodes that ended", "sum"),
-    "terminations": Metric("", "of these, by a rule of the task, as is the limit with `time_limit = terminate`", "sum"),
+    "terminations": Metric("", "episodes ended by the task's rule, or by its limit if `time_limit = terminate`", "sum"),
     "violation_rate": Metric("", "share of steps with a cost above 0 for some agent"),
     "within_limit": Metric(
         "", "share of the episodes that ended whose cost is within the limit, of several costs each"
