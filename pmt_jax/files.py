@@ -72,6 +72,6 @@ def read_rows(metrics: pathlib.Path, missing_ok: bool = True) -> list[dict[str, 
     """
     rows = []
     for line in [] if missing_ok and not metrics.exists() else metrics.read_text(errors="replace").splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
+        with contextlib.suppress(ValueError, RecursionError):
             rows.append(json.loads(line))
     return [row for row in rows if isinstance(row, dict)]

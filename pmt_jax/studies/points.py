@@ -71,7 +71,7 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
 
     Raises:
       UsageError: an unknown setting, a value that does not fit, ranges without draws, a setting that varies and is
-        fixed, two points of one name, or two that would train the same seed.
+        fixed, two points of one name, or two whose seeds overlap.
     """
     named = [point for part in parts for point in _points(part, preset, fixed)]
     several = len({config.task for _, config in named}) > 1
@@ -117,8 +117,8 @@ def _points(part: Part, preset: str, fixed: Mapping[str, Any]) -> list[tuple[lis
 
 
 def _table(env: Any) -> dict[str, Any]:
-    """A task's options {name: value}, from a table or from NAME=VALUE."""
-    return dict(convert("env", [env] if isinstance(env, str) else env))
+    """A task's options {name: value}, from a table or from NAME=VALUE,NAME=VALUE."""
+    return dict(convert("env", _split(env) if isinstance(env, str) else env))
 
 
 def _beside(varied: dict[str, Any], fixed: dict[str, Any]) -> dict[str, Any]:

@@ -103,9 +103,9 @@ class RunLog:
     @property
     def limits(self) -> tuple[float, ...]:
         """Of each cost; the costs and their limits are added in `cost_limit`."""
-        several = sum(name.startswith("cost_limit/") for name in self.metrics)
-        each = [float(np.nanmax(self.metrics[f"cost_limit/{k}"])) for k in range(several)]
-        return tuple(each) or (self.cost_limit,)
+        each = [self.metrics[name].T for name in sorted(self.metrics) if name.startswith("cost_limit/")]
+        known = [x[np.isfinite(x)] for x in each]  # in the order of the steps: --change may have changed them
+        return tuple(float(x[-1]) for x in known if x.size) or (self.cost_limit,)
 
     @property
     def true_limit(self) -> float:
@@ -265,7 +265,7 @@ def _metrics(
                 found[name] = np.full((len(seeds), len(steps)), np.nan)
             try:
                 found[name][place] = math.nan if value is None else value
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 where = f"{name} = {json.dumps(value)[:40]} at step {row['step']}"
                 raise UsageError(f"{file}: a row has {where}, where a number or null belongs") from None
     return found

@@ -65,7 +65,7 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
         code = _train_checked(wanted, launch)
     if code == 0:
         launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        found = rows(read_all([out / name for name in points]))
+        found = rows(read_all([out / name for name in points]), launch.say)
         launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
     return code
 
@@ -87,10 +87,10 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
 
 def _train_checked(programs: Sequence[Program], launch: Launch) -> int:
     """As `train_programs`, but a task or an option that does not exist shows now, not after the programs before it."""
-    first = [next(iter(program.points.values())) for program in programs]
-    if len(programs) > 1:
-        for config in {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in first}.values():
-            make_setup(config)
+    configs = [config for program in programs for config in program.points.values()]
+    kinds = {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in configs}
+    for config in kinds.values() if len(kinds) > 1 else ():  # a single one shows when its program is made
+        make_setup(config)
     return train_programs(programs, launch)
 
 
@@ -146,6 +146,8 @@ def _write_points(program: Program) -> None:
 
 def _finished(folder: pathlib.Path, config: Config) -> bool:
     if not (folder / "config.toml").is_file():
+        if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+            raise UsageError(f"{folder} holds no run but other files; remove them or choose another --out")
         return False
     changes = differences(load_config(folder / "config.toml"), config)
     changed = ", ".join(f"{name}: {change}" for name, change in changes.items())
@@ -160,7 +162,8 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
     for folder in begun:
         group = _points(folder)
-        if group and all(repr(points.get(name)) == repr(config) for name, config in group.items()):
+        wanted = all(repr(points.get(name)) == repr(config) for name, config in group.items())
+        if wanted and any(name in left for name in group):
             left = {name: config for name, config in left.items() if name not in group}
             yield folder, group
     last = max((int(p.name.split("-")[1]) for p in begun), default=0)
@@ -203,7 +206,7 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     setup, step, saved = load_saved(folder / "run")
     rows = read_rows(folder / "run" / "metrics.jsonl")
     for number, (name, config) in enumerate(group.items()):
-        if (out / name).exists():
+        if (out / name / "config.toml").is_file():
             continue
         first = number * config.seeds  # of its trials, whose rows know a rounded limit
         limit = dataclasses.replace(setup, config=config).cost_limit
@@ -219,7 +222,10 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         checkpoints.save(step, jax.tree.map(lambda x: x[first : first + config.seeds], saved))  # noqa: B023
         checkpoints.close()
         part.rename(out / name)
-    shutil.rmtree(folder)
+    done = folder.with_name(folder.name.replace("group", "done"))  # so that no part of it is taken for a group
+    shutil.rmtree(done, ignore_errors=True)
+    folder.rename(done)
+    shutil.rmtree(done, ignore_errors=True)
 
 
 def _own_seed(row: dict[str, Any], offset: int) -> dict[str, Any]:

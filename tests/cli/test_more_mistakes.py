@@ -126,6 +126,7 @@ sweep lane --set clip=0.1,0.2 --clip 0.3 --out s | clip varies and is given by i
 sweep lane --set method=happo,mappo --method macpo --out s | method varies and is given by itself
 sweep lane --set env=num_agents=2,num_agents=3 --env num_agents=4 --out s | the option num_agents varies and is given by
 sweep lane --set seed=0,1 --seeds 2 --out s | 'seed=0' and 'seed=1' would both train seed 1: with seeds = 2 their first
+sweep lane --set cost_limit=1,[1,2] --out s | cost_limit has 2 numbers, but task 'lane' has 1 cost(s); give one number
 sweep lane --set env=num_agents=2,agents=3 --out s | task 'lane' has no option 'agents'
 sweep lane --set clip=0.1,0.2 --out file | cannot write into file: File exists; choose another --out
 sweep lane --set clip=a:b --random 2 --out s | random draws need a range

@@ -137,6 +137,8 @@ def test_options_that_are_given_lie_beside_those_that_vary():
     options = [dict(config.env) for config in found.values()]
     assert [x["partition"] for x in options] == [((0, 1), (2,)), ((0,), (1, 2))]
     assert all(x["cost"] == "excess" and x["observation"] == "raw" for x in options)
+    found = points.make_points([points.from_words("lane", ["env=[num_agents=2,b=1.50],[num_agents=3,b=2]"])])
+    assert list(found) == ["env=b=1.5,num_agents=2", "env=b=2,num_agents=3"]
 
 
 def test_one_value_is_one_point():

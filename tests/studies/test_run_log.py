@@ -12,6 +12,13 @@ from pmt_jax.errors import UsageError
 from pmt_jax.studies import run_log
 
 
+def test_lines_that_no_run_writes(tmp_path: pathlib.Path):
+    lines = [row(10, 0, 1.0), "[" * 10**5 + "\n", '{"step": ' + "9" * 5000 + "}\n"]
+    assert run_log.read(written(tmp_path / "a", lines)).steps.tolist() == [10]
+    with pytest.raises(UsageError, match="where a number or null belongs"):
+        run_log.read(written(tmp_path / "b", [row(10, 0, 10**400)]))
+
+
 def test_metrics_are_read_as_they_stand(tmp_path: pathlib.Path):
     lines = [row(10, 0, None), row(10, 1, 2.0), row(20, 0, 3.0), row(20, 1, 4.0), row(20, 1, 5.0), '{"step": 30, "se']
     log = run_log.read(written(tmp_path / "a", lines))

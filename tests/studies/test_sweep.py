@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pathlib
+import shutil
 import signal
 
 import numpy as np
@@ -111,6 +112,27 @@ def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path:
         once, twice = state(swept / name), state(tmp_path / name)
         assert all(np.array_equal(once[path], twice[path], equal_nan=True) for path in once)
     assert sorted(p.name for p in tmp_path.iterdir()) == NAMES
+
+
+def test_an_empty_folder_in_a_points_place_takes_it_and_other_files_do_not(
+    swept: pathlib.Path, tmp_path: pathlib.Path, cli
+):
+    (tmp_path / NAMES[0]).mkdir()
+    assert cli(*COMMAND, tmp_path)[0] == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == NAMES
+    assert without_seconds(rows(tmp_path / NAMES[0])) == without_seconds(rows(swept / NAMES[0]))
+    (tmp_path / NAMES[0] / "config.toml").unlink()
+    code, _, err = cli(*COMMAND, tmp_path)
+    assert code == 2 and f"{tmp_path / NAMES[0]} holds no run but other files" in err
+
+
+def test_what_is_left_of_a_finished_program_is_not_trained_again(swept: pathlib.Path, tmp_path: pathlib.Path, cli):
+    shutil.copytree(swept, tmp_path / "s")
+    for name in NAMES:
+        (tmp_path / "s" / ".group-1" / "points").mkdir(parents=True, exist_ok=True)
+        shutil.copy(tmp_path / "s" / name / "config.toml", tmp_path / "s" / ".group-1" / "points" / f"{name}.toml")
+    code, out, _ = cli(*COMMAND, tmp_path / "s")
+    assert code == 0 and "2 of 2 points are finished already" in out and "program" not in out
 
 
 class Killed(BaseException):

@@ -53,6 +53,8 @@ def test_limits_are_those_of_the_costs_beside_them(tmp_path: pathlib.Path, cli):
     each = {"cost_limit": 25.1, "cost_limit/0": 25.0, "cost_limit/1": 0.1, "episode_cost": 3.0}
     each |= {"episode_cost/0": 2.0, "episode_cost/1": 1.0}
     written(tmp_path / "two", [row(100, 0, 1.0, **each)])
+    old = each | {"cost_limit": 60.0, "cost_limit/0": 50.0, "cost_limit/1": 10.0}  # before --change
+    (tmp_path / "two" / "metrics.jsonl").write_text(row(50, 0, 1.0, **old) + row(100, 0, 1.0, **each))
     text = cli("table", tmp_path / "two")[1]
     assert "  25 + 0.1  0/1  " in text and "each must be within its own limit" in text
     seen = {"cost_limit": 0.3, "episode_cost": 0.24, "true_episode_cost": 0.8}
