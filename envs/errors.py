@@ -62,7 +62,7 @@ _WORDS = {
     float: "a number",
     bool: "true or false",
     str: "a text",
-    tuple: "a list in brackets",
+    tuple: "a tuple ([a, b] on a command line)",
     types.NoneType: "none",
 }
 

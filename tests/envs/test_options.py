@@ -44,7 +44,9 @@ def test_constructors_check_too_and_take_whole_numbers_for_numbers():
             self.share = share
 
     assert Task(1).share == 1 and Task(share=0.5, blocks=("a",)).share == 0.5
-    with pytest.raises(TaskError, match=r"blocks must be a text or a tuple, not \['a'\]"):
+    with pytest.raises(
+        TaskError, match=r"blocks must be a text or a tuple \(\[a, b\] on a command line\), not \['a'\]"
+    ):
         Task(1, blocks=["a"])
 
 

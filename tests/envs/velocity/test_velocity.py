@@ -256,7 +256,7 @@ def test_standing_still_is_worth_1003_to_the_ant():
         ({"partition": ((0, 1), (2, 3))}, "each of the actuators 0 to 7 to one agent"),
         ({"partition": ((0, 1, 2, 3), (3, 4, 5, 6))}, "each of the actuators 0 to 7 to one agent"),
         ({"partition": (tuple(range(8)), ())}, "every agent at least one"),
-        ({"partition": "all"}, "partition must be a tuple or none, not 'all'"),
+        ({"partition": "all"}, r"partition must be a tuple \(\[a, b\] on a command line\) or none, not 'all'"),
     ],
 )
 def test_mistakes_get_one_sentence(options, said):
