@@ -12,7 +12,7 @@ import numpy as np
 
 from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
-from pmt_jax.formats import markdown
+from pmt_jax.formats import markdown, number
 from pmt_jax.studies import plot, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
@@ -129,7 +129,7 @@ def as_paper(file: pathlib.Path) -> str:
     for label, row in zip((row.label for row in shown), found, strict=True):
         line = [label + (f", limit {row['cost_limit']:g}" if several else "")]
         line += [_mean_std(row[name]["mean"], row[name]["std"]) for name in measured]
-        line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", _number(row["worst"], ".2f")]
+        line += [f"{round(row['within'] * row['seeds'])} of {row['seeds']}", number(row["worst"], ".2f")]
         line += [_mean_std(*row["paper"][name]) if name in row["paper"] else "-" for name in published]
         body.append(line)
     return markdown(head, body)
@@ -144,7 +144,7 @@ def as_summary(files: pathlib.Path) -> str:
     for method in dict.fromkeys(row.label for row in found):
         line = [cells[method, task] for task in tasks]
         words = [
-            f"{_number(x['reward']['mean'], ',.4g')} / {_number(x['cost']['mean'], '.3g')}, "
+            f"{number(x['reward']['mean'], ',.4g')} / {number(x['cost']['mean'], '.3g')}, "
             f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
             for x in line
         ]
@@ -198,10 +198,6 @@ def _mean_std(*mean_and_std: float | None) -> str:
         return "-"
     digits = 2 if abs(mean_and_std[0]) >= 1 else 4
     return " ± ".join(f"{x:,.{digits}f}" for x in mean_and_std)
-
-
-def _number(x: float | None, form: str) -> str:
-    return "-" if x is None else format(x, form)
 
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import UsageError
 from ..files import writing
+from ..formats import limits
 from ..policies import evaluate
 from ..studies import plot, table
 from ..studies.rows import rows
@@ -122,7 +123,7 @@ def _summary(log: RunLog) -> str:
     took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
     return (
         f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "
-        f"limit on an episode's cost {' + '.join(f'{x:g}' for x in log.limits)}."
+        f"limit on an episode's cost {limits(log.limits)}."
     )
 
 

@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 
 from ..config.methods import METHODS
 from ..errors import UsageError
-from ..learning.setup import make_setup
 from ..tasks import did_you_mean, names
 from ..training.claims import claim
 from . import table
 from .points import Part, Points, make_points
 from .rows import rows
 from .run_log import read_all
-from .sweep import ONE_AT_A_TIME, Launch, missing_programs, train_programs
+from .sweep import ONE_AT_A_TIME, Launch, check_tasks, missing_programs, train_programs
 
 
 def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
@@ -38,8 +37,7 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     if absent:
         raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
     plans = {task: plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
-    for points in plans.values():
-        make_setup(next(iter(points.values())))  # an engine that is missing shows now, not after hours
+    check_tasks(next(iter(points.values())) for points in plans.values())
     with contextlib.ExitStack() as stack:
         for task in plans:
             stack.enter_context(claim(out / task))

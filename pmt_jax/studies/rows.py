@@ -16,6 +16,7 @@ import numpy as np
 
 from ..config.methods import METHODS
 from ..errors import UsageError
+from ..formats import limits
 from ..tasks import columns as task_columns
 from . import statistics
 from .run_log import Group, RunLog, Say, groups
@@ -104,10 +105,10 @@ class Row:
         return self.score("cost") - self.cost_limit if self.excess is None else self.excess
 
     def limit_on(self, column: str) -> str:
-        """The limit on the costs of a column; of several costs each, which are added as the costs are."""
+        """The limit on the costs of a column, in words."""
         if column == "true cost" and math.isfinite(self.true_limit):
             return f"{self.true_limit:g}"
-        return " + ".join(f"{x:g}" for x in self.limits or (self.cost_limit,))
+        return limits(self.limits or (self.cost_limit,))
 
     @property
     def label(self) -> str:

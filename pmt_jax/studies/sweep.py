@@ -10,7 +10,7 @@ import dataclasses
 import json
 import pathlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -62,7 +62,8 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
             launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
             with writing(out / "draws.json") as partial:
                 partial.write_text(json.dumps(values, indent=1) + "\n")
-        code = _train_checked(wanted, launch)
+        _check_missing(wanted)
+        code = train_programs(wanted, launch)
     if code == 0:
         launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
         found = rows(read_all([out / name for name in points]), launch.say)
@@ -82,16 +83,30 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
       UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
     """
     with claim(out):
-        return _train_checked(missing_programs(points, out, launch.say), launch)
+        programs = missing_programs(points, out, launch.say)
+        _check_missing(programs)
+        return train_programs(programs, launch)
 
 
-def _train_checked(programs: Sequence[Program], launch: Launch) -> int:
-    """As `train_programs`, but a task or an option that does not exist shows now, not after the programs before it."""
+def _check_missing(programs: Sequence[Program]) -> None:
     configs = [config for program in programs for config in program.points.values()]
-    kinds = {repr((x.task, x.env, x.physics, x.method, x.cost_limit)): x for x in configs}
-    for config in kinds.values() if len(kinds) > 1 else ():  # a single one shows when its program is made
+    if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
+        check_tasks(configs)
+
+
+def check_tasks(configs: Iterable[Config]) -> None:
+    """Makes each task as it is asked for, so that a missing engine or option shows now and not after other programs.
+
+    Raises:
+      UsageError: a task cannot run here as one of the configurations asks for.
+    """
+    for config in {_needs(config): config for config in configs}.values():
         make_setup(config)
-    return train_programs(programs, launch)
+
+
+def _needs(config: Config) -> str:
+    """Equal for configurations whose tasks can be made, or cannot, alike."""
+    return repr((config.task, config.env, config.physics, config.method, config.cost_limit))
 
 
 @dataclasses.dataclass(frozen=True)

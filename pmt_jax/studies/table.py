@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import formats
 from ..errors import UsageError
+from ..formats import number
 from ..tasks import did_you_mean
 from . import compare, statistics
 from .rows import Column, Row, compared, shown
@@ -122,24 +123,20 @@ def _cells(
         within = f"{round(row['within'] * row['seeds'])}/{row['seeds']}"
         line = [row["task"], f"{row['method']} {row['settings']}".strip(), str(row["seeds"]), f"{row['steps']:,}"]
         line += [_interval(row.get(column), "iqm") for column in columns]
-        line += [table[i].limit_on(compared(table)[1]), within, _number(row["worst"])]
+        line += [table[i].limit_on(compared(table)[1]), within, number(row["worst"])]
         line += [_interval((row["better"] or {}).get(name), "probability") for name in better]
-        line += [_number((row["p"] or {}).get(name), ".2g") for name in better if test]
+        line += [number((row["p"] or {}).get(name), ".2g") for name in better if test]
         given = (reported[who][i].get(column) for who, column in papers)
         body.append(line + [" ± ".join(format(part, ".2f") for part in x) if x else "-" for x in given])
     return head, body
-
-
-def _number(x: float | None, form: str = ".4g") -> str:
-    return "-" if x is None else format(x, form)
 
 
 def _interval(estimate: dict[str, float | None] | None, middle: str) -> str:
     """An average and its interval; - for what is unknown."""
     if estimate is None or estimate[middle] is None:
         return "-"
-    ends = "-" if estimate["low"] is None else f"{_number(estimate['low'])}, {_number(estimate['high'])}"
-    return f"{_number(estimate[middle])} [{ends}]"
+    ends = "-" if estimate["low"] is None else f"{number(estimate['low'])}, {number(estimate['high'])}"
+    return f"{number(estimate[middle])} [{ends}]"
 
 
 def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str | None, test: bool) -> list[str]:
@@ -168,10 +165,9 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
 
 def _sources(data: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
     """The sources of reported values that are not the paper's own, each with the tasks of its rows."""
-    tasks: dict[str, list[str]] = {}
+    tasks: dict[str, dict[str, None]] = {}
     for row in data:
         reported = row["paper"]
-        if reported["source"] and {"reward", "cost"} & {*reported, *reported["rerun"]}:
-            known = tasks.setdefault(reported["source"], [])
-            known += [row["task"]] * (row["task"] not in known)
-    return tasks
+        if reported["source"] and (reported["rerun"] or reported.keys() - {"table", "source", "rerun"}):
+            tasks.setdefault(reported["source"], {})[row["task"]] = None
+    return {source: list(found) for source, found in tasks.items()}

@@ -128,10 +128,9 @@ def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> lis
     ]
 
 
-def limits(row: Row) -> str:
-    """The limit of a row in words; of several costs each, which are added as the costs are."""
-    each = [x for name, x in row.items() if name.startswith("cost_limit/")] or [row["cost_limit"]]
-    return " + ".join(f"{x:g}" for x in each)
+def limits_of(row: Row) -> list[float]:
+    """The limit of each cost."""
+    return [x for name, x in row.items() if name.startswith("cost_limit/")] or [row["cost_limit"]]
 
 
 def judged_cost(row: Row, prefix: str) -> tuple[float, float]:

@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from ..formats import limits
 from ..output import dropped_if_closed
-from .metrics import Row, limits
+from .metrics import Row, limits_of
 
 HISTORY = 12  # rows of the live table
 GAP = 2  # characters between its columns
@@ -68,7 +69,7 @@ class Progress:
             f"{step:,}",
             self._number("episode_reward", ".1f"),
             self._number("episode_cost", ".2f"),
-            ", ".join(dict.fromkeys(limits(row) for row in rows)),
+            ", ".join(dict.fromkeys(limits(limits_of(row)) for row in rows)),
             self._number("violation_rate", ".2%"),
             self._number("lambda", ".3f"),
             f"{steps_per_second:,.0f}",

@@ -224,7 +224,7 @@ def test_reproduce_says_what_is_not_there(cli, monkeypatch, tmp_path: pathlib.Pa
         raise UsageError("no engine here")
 
     monkeypatch.setattr(reproduce, "names", lambda: ["ant_2x4", "ant_4x2"])
-    monkeypatch.setattr(reproduce, "make_setup", refuse)
+    monkeypatch.setattr(sweep, "make_setup", refuse)
     assert "no engine here" in cli("reproduce", "table1", "--out", tmp_path / "x")[2]
     assert not (tmp_path / "x").exists()
 
