@@ -11,6 +11,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import itertools
+import os
 import statistics
 import subprocess
 import time
@@ -270,7 +271,8 @@ def _busy() -> Iterator[list[float]]:
     if jax.devices()[0].platform != "gpu":
         yield found
         return
-    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits", "-i", "0", "-lms", "100"]
+    used = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]  # nvidia-smi counts all that the machine has
+    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits", "-i", used, "-lms", "100"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         yield found
         process.terminate()

@@ -1,6 +1,6 @@
 """Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
 
-Its LAST commands follow one by one, alone on the machine.
+Its FIRST commands have the last GPU alone, one by one, before that takes others.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     if begun.exists():
         command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
     command = [*command, "--out", str(begun.parent)]
-    if SMOKE:
+    if SMOKE and "pmt_jax" in command:
         tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
         command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
@@ -51,20 +51,24 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def room(running: list[Running]) -> int | None:
-    """The GPU for the next run, which has the fewest programs; None if no GPU has room."""
-    at = [sum(gpu == there for there, _, _ in running) for gpu in range(GPUS)]
-    return at.index(min(at)) if min(at) < jobs.PROGRAMS else None
+def room(running: list[Running], gpus: int) -> int | None:
+    """The one of the first `gpus` GPUs for the next run, which has the fewest programs; None if none has room."""
+    at = [sum(gpu == there for there, _, _ in running) for gpu in range(gpus)]
+    return at.index(min(at)) if min(at, default=jobs.PROGRAMS) < jobs.PROGRAMS else None
 
 
 def main() -> None:
-    queue, running = list(jobs.JOBS.items()), list[Running]()
-    while time.time() - BEGIN < END and (queue or running):
+    first, queue, running = list(jobs.FIRST.items()), list(jobs.JOBS.items()), list[Running]()
+    while time.time() - BEGIN < END and (first or queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        if queue and (free := room(running)) is not None:
+        alone = any(name in jobs.FIRST for _, name, _ in running)
+        if first and not alone:
+            name, command = first.pop(0)
+            running.append((GPUS - 1, name, start(GPUS - 1, name, command.split())))
+        elif queue and (free := room(running, GPUS - bool(first or alone))) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
         else:
@@ -77,9 +81,6 @@ def main() -> None:
         except subprocess.TimeoutExpired:
             log(name, "did not end")
             process.kill()
-    for name, command in () if SMOKE else jobs.LAST.items():
-        process = start(0, name, command.split())
-        log(name, "ended with", process.wait())
 
 
 if __name__ == "__main__":
