@@ -1,6 +1,6 @@
 """Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
 
-Its FIRST commands have the last GPU alone, one by one, before that takes others.
+When its TRIAL_RUNS have ended, the cells whose settings they choose come next (choose.py).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 
+import choose
 import jobs
 
 HERE = pathlib.Path(__file__).parent
@@ -20,6 +21,7 @@ OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
 GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
+Job = tuple[str, str]
 Running = tuple[int, str, subprocess.Popen[bytes]]
 ENVIRONMENT = {  # beside what setup.sh exports
     "PYTHONUNBUFFERED": "1",
@@ -51,24 +53,33 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def room(running: list[Running], gpus: int) -> int | None:
-    """The one of the first `gpus` GPUs for the next run, which has the fewest programs; None if none has room."""
-    at = [sum(gpu == there for there, _, _ in running) for gpu in range(gpus)]
-    return at.index(min(at)) if min(at, default=jobs.PROGRAMS) < jobs.PROGRAMS else None
+def room(running: list[Running], most: int) -> int | None:
+    """The GPU for the next run, which has the fewest programs; None if all have `most`."""
+    at = [sum(gpu == there for there, _, _ in running) for gpu in range(GPUS)]
+    return at.index(min(at)) if min(at) < most else None
+
+
+def with_cells(queue: list[Job]) -> list[Job]:
+    """The queue with the runs that the trial chooses; without them if it cannot be read, as the others shall run."""
+    try:
+        soon, late = choose.cells(OUT / "runs/limits")
+        return [*soon.items(), *queue, *late.items()]
+    except Exception as error:
+        log("no cells:", repr(error))
+        return queue
 
 
 def main() -> None:
-    first, queue, running = list(jobs.FIRST.items()), list(jobs.JOBS.items()), list[Running]()
-    while time.time() - BEGIN < END and (first or queue or running):
+    queue, running, awaited = list(jobs.JOBS.items()), list[Running](), set(jobs.TRIAL_RUNS)
+    while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        alone = any(name in jobs.FIRST for _, name, _ in running)
-        if first and not alone:
-            name, command = first.pop(0)
-            running.append((GPUS - 1, name, start(GPUS - 1, name, command.split())))
-        elif queue and (free := room(running, GPUS - bool(first or alone))) is not None:
+                if name in awaited:
+                    awaited.remove(name)
+                    queue = queue if awaited else with_cells(queue)
+        if queue and (free := room(running, 1 if awaited else jobs.PROGRAMS)) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
         else:

@@ -137,20 +137,37 @@ def as_paper(file: pathlib.Path) -> str:
 
 def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
+    cells = _summaries(files)
+    tasks, methods = (list(dict.fromkeys(name)) for name in zip(*cells, strict=True))
+    limits = {row.task: row.cost_limit for row, _ in cells.values()}
+    head = ["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)]
+    return markdown(head, [[f"`{method}`", *(cells[task, method][1] for task in tasks)] for method in methods])
+
+
+def as_overview(files: pathlib.Path) -> str:
+    """As `summary`, but tasks by methods, and of the methods with a multiplier only those whose multiplier has PID."""
+    cells = {
+        (task, row.method): text
+        for (task, _), (row, text) in _summaries(files).items()
+        if row.settings or METHODS[row.method].constraint != "lagrangian"
+    }
+    methods = [method for method in METHODS if any(method == name for _, name in cells)]
+    body = [
+        [f"`{task}`", *(cells.get((task, method), "-") for method in methods)]
+        for task in dict.fromkeys(task for task, _ in cells)
+    ]
+    return markdown(["", *(f"`{method}`" for method in methods)], body)
+
+
+def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[Row, str]]:
+    """{(task, label): a row, and its mean reward / cost and how many seeds keep the limit} of files that a + joins."""
     found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
-    tasks = list(dict.fromkeys(row.task for row in found))
-    cells = {(row.label, row.task): x for row, x in zip(found, table.summarise(found), strict=True)}
-    body = []
-    for method in dict.fromkeys(row.label for row in found):
-        line = [cells[method, task] for task in tasks]
-        words = [
-            f"{number(x['reward']['mean'], ',.4g')} / {number(x['cost']['mean'], '.3g')}, "
-            f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
-            for x in line
-        ]
-        body.append([f"`{method}`", *words])
-    limits = {row.task: row.cost_limit for row in found}
-    return markdown(["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)], body)
+    words = [
+        f"{number(x['reward']['mean'], ',.4g')} / {number(x['cost']['mean'], '.3g')}, "
+        f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
+        for x in table.summarise(found)
+    ]
+    return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
 
 
 def as_ran(files: pathlib.Path) -> str:
@@ -249,6 +266,7 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "method": as_method,
     "paper": as_paper,
     "summary": as_summary,
+    "overview": as_overview,
     "ran": as_ran,
     "pairs": as_pairs,
 }
