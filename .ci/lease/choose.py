@@ -69,13 +69,13 @@ def _multiplier(logs: Iterable[RunLog]) -> str:
 
 def _macpo(logs: Iterable[RunLog]) -> str:
     """The rule: three of four seeds within 1 at a mean reward of at least 1,220, and of these the lowest mean cost."""
-    trials = {log.settings["kl_limit"]: _trial(log) for log in logs}
-    print(f"MACPO by kl_limit: {trials}")
-    kept = [kl for kl, trial in trials.items() if trial.within >= 3 and trial.reward >= 1220]
+    trials = {(log.settings["kl_limit"], log.settings["cost_estimate"]): _trial(log) for log in logs}
+    print(f"MACPO: {trials}")
+    kept = [setting for setting, trial in trials.items() if trial.within >= 3 and trial.reward >= 1220]
     if not kept:
         return AT_TEN
-    best = min(kept, key=lambda kl: trials[kl].cost)
-    return f"--method=macpo --limit-lr=0.1 --kl-limit={best:g} --cost-estimate=average {SPREAD}"
+    kl, estimate = min(kept, key=lambda setting: trials[setting].cost)
+    return f"--method=macpo --limit-lr=0.1 --kl-limit={kl:g} --cost-estimate={estimate} {SPREAD}"
 
 
 def _floors() -> dict[str, dict[float, Trial]]:

@@ -5,16 +5,19 @@ from __future__ import annotations
 END = 1630.0  # seconds after asking
 
 # The study of limits, a trial first (docs/appendix/preregistration.md): episodes that begin evenly spread over the time
-# limit, with three rules of the multiplier and with MACPO, on other seeds.
+# limit, with three rules of the multiplier and two estimates of MACPO's cost, on other seeds.
 TRIAL = "-m pmt_jax sweep paper/ant_2x4 --method=mappo_l --seed=90 --seeds=5 --steps=8.4e6 --episode-starts=spread"
 TRIAL += " --set cost_limit=0.2,1 --cost-margin=0.5 --lambda-max=100 --cost-estimate=average"
 SPREAD = {
     "limits/spread-relative": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=relative --lambda-lr=0.005",
     "limits/spread-equal": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=limit --lambda-lr=0.02",
     "limits/spread-pid": f"{TRIAL} --set lambda_kp=2,6 --lambda-rule=pid --lambda-unit=limit --lambda-lr=0.01",
-    "limits/spread-macpo": "-m pmt_jax sweep paper/ant_2x4 --method=macpo --seed=90 --seeds=4 --steps=8.4e6"
-    " --episode-starts=spread --set kl_limit=0.01,0.03 --cost-limit=1 --cost-margin=0.5 --cost-estimate=average"
-    " --limit-lr=0.1",
+    **{
+        f"limits/spread-macpo-{estimate}": "-m pmt_jax sweep paper/ant_2x4 --method=macpo --seed=90 --seeds=4 --steps=8.4e6"
+        " --episode-starts=spread --set kl_limit=0.01,0.03 --cost-limit=1 --cost-margin=0.5 --limit-lr=0.1"
+        f" --cost-estimate={estimate}"
+        for estimate in ("average", "rate")
+    },
 }
 
 # While these train, each has a GPU to itself; when all have ended, `choose.py` puts the cells before what is left.
@@ -48,5 +51,13 @@ FEAR = {
     for method in ("f4sg", "mappo_l")
 }
 
+# All methods on the same days: the 64 episodes of the certificate and of the baselines. Few minutes a program.
+GRIDS = {
+    f"grids/{grid}-{method}": f"-m pmt_jax train paper/voltage_{grid} --method={method} --eval-interval=15"
+    " --eval-episodes=64"
+    for grid in ("141", "33")
+    for method in ("mixed", "f4sg", "macpo", "r4sg", "mappo_l", "happo", "mappo")
+}
+
 # Programs at a time on a GPU after the trial, and the runs. After these: WALLS, the other ant, limits of 25.
-PROGRAMS, JOBS = 4, SPREAD | VELOCITY | FEAR | OTHER_ANT
+PROGRAMS, JOBS = 4, SPREAD | VELOCITY | GRIDS | FEAR | OTHER_ANT

@@ -439,6 +439,22 @@ def test_only_a_multiplier_is_called_pid(tmp_path: pathlib.Path):
     assert [line.split(" | ")[0] for line in lines] == ["| mappo", "| macpo", "| f4sg pid"]
 
 
+def test_an_overview_has_multipliers_with_pid_only(tmp_path: pathlib.Path):
+    """And "-" where a method of another task is missing."""
+    for task, methods in {"lane": ("mappo", "f4sg", "mixed"), "switch": ("mappo", "f4sg")}.items():
+        for method in methods:
+            run = fake_run(tmp_path / task / method, lambda_rule='"integral"' if method == "mixed" else '"pid"')
+            for file in (run / "config.toml", run / "metrics.jsonl"):
+                file.write_text(file.read_text().replace("happo", method).replace("lane", task))
+        runs.store([tmp_path / task], tmp_path / f"{task}.json")
+    runs.store([tmp_path / "lane" / "mappo"], tmp_path / "mappo.json")
+    head, _, *lines = runs.as_overview(tmp_path / "lane+switch.json").splitlines()
+    assert head == "|  | `mappo` | `f4sg` |"
+    assert [line.split(" | ")[0] for line in lines] == ["| `lane`", "| `switch`"]
+    (lane, switch) = runs.as_overview(tmp_path / "mappo+switch.json").splitlines()[2:]
+    assert lane.endswith(" | - |") and " - " not in switch
+
+
 def test_paths_of_ants_are_stored_and_drawn(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
