@@ -19,6 +19,7 @@ RESULTS = pathlib.Path(__file__).parents[2] / "bench/results"
 ANT = "-m pmt_jax train paper/ant_2x4 --seeds=20 --cost-margin=0.5"
 SPREAD = "--episode-starts=spread"
 AVERAGE = "--cost-estimate=average --lambda-max=100"
+MACPO = ("kl_limit", "limit_lr", "cost_estimate")  # what its trials vary
 AT_TEN = "--method=macpo --limit-lr=0.1 --kl-limit=0.03"  # MACPO's settings of the cell at a limit of 10
 
 
@@ -69,13 +70,14 @@ def _multiplier(logs: Iterable[RunLog]) -> str:
 
 def _macpo(logs: Iterable[RunLog]) -> str:
     """The rule: three of four seeds within 1 at a mean reward of at least 1,220, and of these the lowest mean cost."""
-    trials = {(log.settings["kl_limit"], log.settings["cost_estimate"]): _trial(log) for log in logs}
+    trials = {tuple(log.settings[name] for name in MACPO): _trial(log) for log in logs}
     print(f"MACPO: {trials}")
     kept = [setting for setting, trial in trials.items() if trial.within >= 3 and trial.reward >= 1220]
     if not kept:
         return AT_TEN
-    kl, estimate = min(kept, key=lambda setting: trials[setting].cost)
-    return f"--method=macpo --limit-lr=0.1 --kl-limit={kl:g} --cost-estimate={estimate} {SPREAD}"
+    best = min(kept, key=lambda setting: trials[setting].cost)
+    flags = " ".join(f"--{name.replace('_', '-')}={value}" for name, value in zip(MACPO, best, strict=True))
+    return f"--method=macpo {flags} {SPREAD}"
 
 
 def _floors() -> dict[str, dict[float, Trial]]:
