@@ -5,21 +5,24 @@ from __future__ import annotations
 END = 1630.0  # seconds after asking
 
 # The study of limits, a trial first (docs/appendix/preregistration.md): episodes that begin evenly spread over the time
-# limit, with three rules of the multiplier and two estimates of MACPO's cost, on other seeds.
+# limit, with three rules of the multiplier and three forms of MACPO, on other seeds.
 TRIAL = "-m pmt_jax sweep paper/ant_2x4 --method=mappo_l --seed=90 --seeds=5 --steps=8.4e6 --episode-starts=spread"
 TRIAL += " --set cost_limit=0.2,1 --cost-margin=0.5 --lambda-max=100 --cost-estimate=average"
-MACPO_TRIAL = "-m pmt_jax sweep paper/ant_2x4 --method=macpo --seed=90 --seeds=4 --steps=8.4e6 --episode-starts=spread"
-MACPO_TRIAL += " --set kl_limit=0.01,0.03 --cost-limit=1 --cost-margin=0.5"
+MACPO_TRIAL = "sweep paper/ant_2x4 --seed=90 --seeds=4 --steps=8.4e6 --episode-starts=spread"
+MACPO_TRIAL += " --set kl_limit=0.01,0.03 --cost-limit=1 --cost-margin=0.5 --limit-lr=0.1"
 SPREAD = {
     "limits/spread-relative": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=relative --lambda-lr=0.005",
     "limits/spread-equal": f"{TRIAL} --set cost_std_floor=0.05,0.2 --lambda-unit=limit --lambda-lr=0.02",
     "limits/spread-pid": f"{TRIAL} --set lambda_kp=2,6 --lambda-rule=pid --lambda-unit=limit --lambda-lr=0.01",
-    "limits/spread-macpo-average": f"{MACPO_TRIAL} --cost-estimate=average --limit-lr=0.1",
-    "limits/spread-macpo-rate": f"{MACPO_TRIAL} --cost-estimate=rate --set limit_lr=0.03,0.1",
+    "limits/spread-macpo-fear": f".ci/lease/macpo_fear.py {MACPO_TRIAL} --method=macpo_fear --cost-estimate=rate",
+    "limits/spread-macpo-rate": f"-m pmt_jax {MACPO_TRIAL} --method=macpo --cost-estimate=rate",
+    "limits/spread-macpo-average": f"-m pmt_jax {MACPO_TRIAL} --method=macpo --cost-estimate=average",
 }
 
-# While these train, each has a GPU to itself; when all have ended, `choose.py` puts the cells before what is left.
+# When these have ended, `choose.py` puts the cells before what is left. Until then a GPU has one of the larger ones, or
+# the three of MACPO.
 TRIAL_RUNS = tuple(SPREAD)
+WEIGHTS = {name: 3 for name in SPREAD if "macpo" not in name}  # as how many programs they count
 
 MACPO = "--method=macpo --limit-lr=0.1 --kl-limit=0.03 --seed=440 --seeds=20 --cost-limit=10 --cost-margin=0.5"
 OTHER_ANT = {"limits/macpo_4x2": f"-m pmt_jax train paper/ant_4x2 {MACPO}"}
@@ -59,5 +62,5 @@ GRIDS = {
     for method in ("mixed", "f4sg", "macpo", "r4sg", "mappo_l", "happo", "mappo")
 }
 
-# Programs at a time on a GPU after the trial, and the runs. After these: WALLS, the other ant, limits of 25.
+# Programs at a time on a GPU (three during the trial), and the runs. After these: WALLS, the other ant, limits of 25.
 PROGRAMS, JOBS = 4, SPREAD | VELOCITY | GRIDS | FEAR | OTHER_ANT

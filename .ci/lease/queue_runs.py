@@ -41,7 +41,7 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     if begun.exists():
         command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
     command = [*command, "--out", str(begun.parent)]
-    if SMOKE and "pmt_jax" in command:
+    if SMOKE:
         tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
         command += tiny.split()
     (OUT / "logs").mkdir(parents=True, exist_ok=True)
@@ -53,10 +53,10 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def room(running: list[Running], most: int) -> int | None:
-    """The GPU for the next run, which has the fewest programs; None if all have `most`."""
-    at = [sum(gpu == there for there, _, _ in running) for gpu in range(GPUS)]
-    return at.index(min(at)) if min(at) < most else None
+def room(running: list[Running], next_run: str, most: int) -> int | None:
+    """The GPU for the next run, which has the fewest programs; None if no GPU has room for it among `most`."""
+    at = [sum(jobs.WEIGHTS.get(name, 1) for there, name, _ in running if there == gpu) for gpu in range(GPUS)]
+    return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= most else None
 
 
 def with_cells(queue: list[Job]) -> list[Job]:
@@ -79,7 +79,7 @@ def main() -> None:
                 if name in awaited:
                     awaited.remove(name)
                     queue = queue if awaited else with_cells(queue)
-        if queue and (free := room(running, 1 if awaited else jobs.PROGRAMS)) is not None:
+        if queue and (free := room(running, queue[0][0], 3 if awaited else jobs.PROGRAMS)) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
         else:
