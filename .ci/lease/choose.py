@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import macpo_fear  # noqa: F401  # adds the method to the table, so that its runs can be read
+from jobs import AT_TEN
 
 from pmt_jax.studies.run_log import RunLog, read_all
 
@@ -23,7 +24,6 @@ SPREAD = "--episode-starts=spread"
 AVERAGE = "--cost-estimate=average --lambda-max=100"
 PMT = ".ci/lease/macpo_fear.py"  # `pmt` that has this method, too
 MACPO = ("method", "kl_limit", "limit_lr", "cost_estimate")  # what its trials vary
-AT_TEN = "--method=macpo --limit-lr=0.1 --kl-limit=0.03"  # MACPO's settings of the cell at a limit of 10
 
 
 class Trial(NamedTuple):
