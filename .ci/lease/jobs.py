@@ -19,8 +19,8 @@ SPREAD = {
     "limits/spread-macpo-average": f"-m pmt_jax {MACPO_TRIAL} --method=macpo --cost-estimate=average",
 }
 
-# When these have ended, `choose.py` puts the cells before what is left. Until then a GPU has one of the larger ones, or
-# the three of MACPO.
+# When these have ended, `choose.py` puts the cells before what is left, but for BEFORE_CELLS. Until then a GPU has one
+# of the larger ones, or the three of MACPO.
 TRIAL_RUNS = tuple(SPREAD)
 WEIGHTS = {name: 3 for name in SPREAD if "macpo" not in name}  # as how many programs they count
 
@@ -39,11 +39,16 @@ WALLS = {
 
 # The rows of the velocity tasks' table that ended before ten million steps, from the start.
 METHODS = {"macpo": "macpo", "mappo_l": "mappo_l", "happo": "happo", "mappo": "mappo", "mixed-pid": "mixed --seed=10"}
-METHODS |= {"integral": "mappo_l --lambda-rule=integral --lambda-kp=0"}
-ROWS = [("hopper_3x1", name) for name in ("mappo_l", "happo", "mappo")]
-ROWS += [("half_cheetah_6x1", name) for name in ("macpo", "mappo_l", "happo", "mappo")]
-ROWS += [("ant_2x4", name) for name in ("macpo", "mappo_l", "happo", "mappo", "mixed-pid")]
+METHODS |= {
+    "integral": "mappo_l --lambda-rule=integral --lambda-kp=0",
+    "f4sg": "f4sg",
+    "r4sg": "r4sg",
+    "mixed": "mixed",
+}
+ROWS = [("ant_2x4", name) for name in ("macpo", "mappo_l", "mixed-pid", "happo", "mappo")]
 ROWS += [("ant_4x2", name) for name in ("integral", "happo", "mappo")]
+ROWS += [("hopper_3x1", name) for name in ("macpo", "mappo_l", "f4sg", "r4sg", "mixed", "happo", "mappo")]
+ROWS += [("half_cheetah_6x1", name) for name in ("macpo", "mappo_l", "happo", "mappo")]
 VELOCITY = {
     f"velocity/{task}-{name}": f"-m pmt_jax train velocity_{task} --preset=benchmark --method={METHODS[name]}"
     for task, name in ROWS
@@ -67,3 +72,4 @@ GRIDS = {
 
 # Programs at a time on a GPU (three during the trial), and the runs. After these: WALLS, the other ant, limits of 25.
 PROGRAMS, JOBS = 4, SPREAD | VELOCITY | GRIDS | FEAR | OTHER_ANT
+BEFORE_CELLS = VELOCITY | GRIDS  # of JOBS, those that the cells wait for

@@ -63,7 +63,9 @@ def with_cells(queue: list[Job]) -> list[Job]:
     """The queue with the runs that the trial chooses; without them if it cannot be read, as the others shall run."""
     try:
         soon, late = choose.cells(OUT / "runs/limits")
-        return [*soon.items(), *queue, *late.items()]
+        first = [job for job in queue if job[0] in jobs.BEFORE_CELLS]
+        rest = [job for job in queue if job[0] not in jobs.BEFORE_CELLS]
+        return [*first, *soon.items(), *rest, *late.items()]
     except Exception as error:
         log("no cells:", repr(error))
         return queue
