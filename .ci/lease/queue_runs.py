@@ -1,6 +1,6 @@
 """Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
 
-When its TRIAL_RUNS have ended, the cells whose settings they choose come next (choose.py).
+When its TRIAL has ended, the cells whose settings it chooses come next (choose.py).
 """
 
 from __future__ import annotations
@@ -53,26 +53,30 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
         )
 
 
-def room(running: list[Running], next_run: str, most: int) -> int | None:
-    """The GPU for the next run, which has the fewest programs; None if no GPU has room for it among `most`."""
+def room(running: list[Running], next_run: str) -> int | None:
+    """The GPU for the next run, which has the least to do; None if no GPU has room for it."""
     at = [sum(jobs.WEIGHTS.get(name, 1) for there, name, _ in running if there == gpu) for gpu in range(GPUS)]
-    return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= most else None
+    return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= jobs.PROGRAMS else None
 
 
 def with_cells(queue: list[Job]) -> list[Job]:
-    """The queue with the runs that the trial chooses; without them if it cannot be read, as the others shall run."""
+    """The queue with the cells that the trial chooses; without them if it cannot be read, as the others shall run.
+
+    If its form kept the limit, that cell comes first, and the tighter one after the cells that are left.
+    """
     try:
-        soon, late = choose.cells(OUT / "runs/limits")
-        first = [job for job in queue if job[0] in jobs.BEFORE_CELLS]
-        rest = [job for job in queue if job[0] not in jobs.BEFORE_CELLS]
-        return [*first, *soon.items(), *rest, *late.items()]
+        found, kept = choose.cells(OUT / "runs" / next(iter(jobs.TRIAL)))
     except Exception as error:
         log("no cells:", repr(error))
         return queue
+    first, second = found.items()
+    others = [job for job in queue if job[0] in jobs.CELLS]
+    rest = [job for job in queue if job[0] not in jobs.CELLS]
+    return [first, *others, second, *rest] if kept else [*queue, first, second]
 
 
 def main() -> None:
-    queue, running, awaited = list(jobs.JOBS.items()), list[Running](), set(jobs.TRIAL_RUNS)
+    queue, running, awaited = list(jobs.JOBS.items()), list[Running](), set(jobs.TRIAL)
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
@@ -81,7 +85,7 @@ def main() -> None:
                 if name in awaited:
                     awaited.remove(name)
                     queue = queue if awaited else with_cells(queue)
-        if queue and (free := room(running, queue[0][0], 3 if awaited else jobs.PROGRAMS)) is not None:
+        if queue and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
         else:

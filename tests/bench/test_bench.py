@@ -420,9 +420,9 @@ def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
     one["table"] = {column: [None, *scores[1:]] for column, scores in one["table"].items()}
     file = tmp_path / "broken.json"
     file.write_text(json.dumps(found))
-    assert runs.as_paper(file).splitlines()[-1] == "| mixed | - | - | 4 of 5 | - | - | - |"
+    assert runs.as_paper(file).splitlines()[-1] == "| mixed pid | - | - | 4 of 5 | - | - | - |"
     assert "- / -, 4 of 5" in runs.as_summary(file)
-    assert "| 24 of 25 |" in runs.as_ran(file)
+    assert "| 19 of 20 |" in runs.as_ran(file)
     assert any("| mixed" in line and "| - | - | - |" in line for line in runs.as_points(file).splitlines())
 
 
