@@ -1,7 +1,7 @@
 """The cells of MACPO in the study of limits, with the settings that its trial chooses (preregistration.md).
 
-`cells(FOLDER)` reads the trial below FOLDER, as the queue of a lease does when it has ended. As a script:
-choose.py FOLDER, which prints them.
+`cells(FOLDERS)` reads the trial's folders, as the queue of a lease does when it has ended. As a script:
+choose.py FOLDER..., which prints them.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 import pathlib
 import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import macpo_fear  # noqa: F401  # adds the method to the table, so that its runs can be read
-from jobs import ANT, AT_TEN
+from jobs import ANT, AT_TEN, FORM
 
 from pmt_jax.studies.run_log import RunLog, read_all
-
-KEPT = "--method=macpo_fear --limit-lr=0.1 --cost-estimate=rate --episode-starts=spread"
 
 
 class Trial(NamedTuple):
@@ -27,17 +26,17 @@ class Trial(NamedTuple):
     within: int
 
 
-def cells(folder: pathlib.Path) -> tuple[dict[str, str], bool]:
+def cells(folders: Sequence[pathlib.Path]) -> tuple[dict[str, str], bool]:
     """{name: command} of the cells at 1 and 0.2, and whether a form of the trial kept 1.
 
     The rule: three of four seeds within 1 at a mean reward of at least 1,220, and of these forms the lowest mean cost.
     """
-    trials = {log.settings["kl_limit"]: _trial(log) for log in read_all([folder])}
+    trials = {log.settings["kl_limit"]: _trial(log) for log in read_all(folders)}
     print(trials, flush=True)
     kept = [kl_limit for kl_limit, trial in trials.items() if trial.within >= 3 and trial.reward >= 1220]
     if kept:
         best = min(kept, key=lambda kl_limit: trials[kl_limit].cost)
-        start = f".ci/lease/macpo_shrink.py {ANT} {KEPT} --kl-limit={best:g}"
+        start = f".ci/lease/macpo_shrink.py {ANT} {FORM} --kl-limit={best:g}"
     else:
         start = f"-m pmt_jax {ANT} {AT_TEN}"
     return {f"limits/macpo-{limit}": f"{start} --seed=440 --cost-limit={limit}" for limit in ("1", "0.2")}, bool(kept)
@@ -52,5 +51,5 @@ def _trial(log: RunLog) -> Trial:
 
 
 if __name__ == "__main__":
-    for name, command in cells(pathlib.Path(sys.argv[1]))[0].items():
+    for name, command in cells([pathlib.Path(folder) for folder in sys.argv[1:]])[0].items():
         print(name, command)

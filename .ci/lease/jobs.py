@@ -6,17 +6,18 @@ END = 1630.0  # seconds after asking
 
 # The study of limits, a trial first (docs/appendix/preregistration.md): MACPO with fear, whose trust region shrinks.
 # When it has ended, `choose.py` puts the cells of MACPO before what is left.
+FORM = "--method=macpo_fear --limit-lr=0.1 --cost-estimate=rate --episode-starts=spread"  # in the cells too, if it wins
 TRIAL = {
-    "limits/shrink": ".ci/lease/macpo_shrink.py sweep paper/ant_2x4 --method=macpo_fear --seed=90 --seeds=4 --set"
-    " kl_limit=0.03,0.06 --cost-limit=1 --cost-margin=0.5 --limit-lr=0.1 --cost-estimate=rate --episode-starts=spread"
+    "limits/shrink": ".ci/lease/macpo_shrink.py sweep paper/ant_2x4 --seed=90 --seeds=4 --cost-limit=1"
+    f" --cost-margin=0.5 --set kl_limit=0.03,0.06 {FORM}"
 }
 
 # Its cells of the methods with a multiplier, with the settings that the trial of spread episodes chose.
 ANT = "train paper/ant_2x4 --seeds=20 --cost-margin=0.5"
 RELATIVE = "--lambda-unit=relative --lambda-lr=0.005 --lambda-max=100 --cost-std-floor=0.05 --cost-estimate=average"
+RELATIVE += " --episode-starts=spread"
 CELLS = {
-    f"limits/{method}-{limit}": f"-m pmt_jax {ANT} --method={method} --seed=480 --cost-limit={limit}"
-    f" {RELATIVE} --episode-starts=spread"
+    f"limits/{method}-{limit}": f"-m pmt_jax {ANT} --method={method} --seed=480 --cost-limit={limit} {RELATIVE}"
     for limit in ("0.2", "1", "10")
     for method in ("mappo_l", "f4sg")
 }

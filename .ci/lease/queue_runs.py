@@ -39,7 +39,8 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
     """`command` is what follows `python`; a run gets its folder, and continues if an earlier lease began it."""
     begun = OUT / "runs" / name / "config.toml"  # a sweep has none, and goes on by itself
     if begun.exists():
-        command = ["-m", "pmt_jax", "train", str(begun), "--resume"]
+        program = command[: command.index("train")]  # a script of this folder may have changed the method
+        command = [*program, "train", str(begun), "--resume"]
     command = [*command, "--out", str(begun.parent)]
     if SMOKE:
         tiny = "--num-envs=4 --rollout-length=8 --steps=64 --epochs=1 --minibatches=1 --log-interval=1 --seeds=2"
@@ -65,7 +66,7 @@ def with_cells(queue: list[Job]) -> list[Job]:
     If its form kept the limit, that cell comes first, and the tighter one after the cells that are left.
     """
     try:
-        found, kept = choose.cells(OUT / "runs" / next(iter(jobs.TRIAL)))
+        found, kept = choose.cells([OUT / "runs" / name for name in jobs.TRIAL])
     except Exception as error:
         log("no cells:", repr(error))
         return queue
