@@ -65,6 +65,12 @@ class Hyper:
         "bound on how far an update by clipped epochs moves a policy, mean KL in nats; a longer step is shortened",
         Bound("be a number of nats above 0, or inf", lambda x: x > 0),
     )
+    kl_half_life: float = learning(
+        math.inf,
+        "environment steps of a seed in which kl_max and kl_limit halve; inf keeps them. A step's divergence is the "
+        "square of its length, so half of lr_half_life shrinks both alike",
+        Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+    )
     max_grad_norm: float = learning(10.0, "gradients are scaled down to this global norm", POSITIVE)
     gamma: float = learning(0.99, "discount per control step, for reward and cost alike", SHARE)
     gae_lambda: float = learning(0.95, "lambda of generalised advantage estimation, for reward and cost alike", SHARE)

@@ -149,12 +149,20 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    """`hyper` with the learning rates after so many updates."""
-    # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
-    left = jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / hyper.lr_half_life))
+    """`hyper` with the learning rates, and the bounds on a policy's step, after so many updates."""
+
+    def left(half_life: jax.Array | float) -> jax.Array:
+        # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
+        return jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / half_life))
+
     rates = {name: getattr(hyper, name) for name in ("actor_lr", "critic_lr", "emotion_lr")}
     rates["fear_lr_start"] = hyper.fear_lr_start / (update + 1)
-    return dataclasses.replace(hyper, **{name: rate * left for name, rate in rates.items()})
+    rates = {name: rate * left(hyper.lr_half_life) for name, rate in rates.items()}
+    # No share of an infinite bound is 0 times it.
+    bounds = {
+        name: getattr(hyper, name) * jnp.maximum(left(hyper.kl_half_life), 1e-30) for name in ("kl_max", "kl_limit")
+    }
+    return dataclasses.replace(hyper, **rates, **bounds)
 
 
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:

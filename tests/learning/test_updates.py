@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import chex
 import jax
@@ -154,6 +155,16 @@ def test_learning_rates_of_all_networks_halve_in_their_half_life():
     chex.assert_trees_all_equal(second, made.step(made.hyper(**halved), first)[0])
     with pytest.raises(AssertionError):
         chex.assert_trees_all_equal(second.actor, made.step(plain, first)[0].actor)
+
+
+@pytest.mark.parametrize("start", [0.03, math.inf])
+def test_bounds_on_a_policys_step_halve_in_their_half_life(start: float):
+    setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
+    hyper = dataclasses.replace(setup.hyper, kl_max=start, kl_limit=start, kl_half_life=jnp.float32(8192))
+    held = jax.vmap(lambda update: learner._annealed(setup, hyper, update))(jnp.asarray([0, 1, 3, 2**20], jnp.int32))
+    for bound in (held.kl_max, held.kl_limit):
+        np.testing.assert_allclose(bound, [start, start / 2, start / 8, start * 1e-30], rtol=1e-6)
+    assert held.actor_lr.tolist() == [setup.hyper.actor_lr] * 4
 
 
 @pytest.mark.full
