@@ -1,7 +1,7 @@
-"""The cells of MACPO in the study of limits, with the settings that its trial chooses (preregistration.md).
+"""The cells of the study of limits, with the settings that its trials choose (preregistration.md).
 
-`cells(FOLDERS)` reads the trial's folders, as the queue of a lease does when it has ended. As a script:
-choose.py FOLDER..., which prints them.
+`cells(TRIAL, FOLDERS)` reads a trial's folders, as the queue of a lease does when it has ended. As a script:
+choose.py multiplier|macpo FOLDER..., which prints them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import macpo_fear  # noqa: F401  # adds the method to the table, so that its runs can be read
-from jobs import ANT, AT_TEN, FORM
+from jobs import MACPO, WITH_MULTIPLIER, WITH_TRUST_REGION
 
 from pmt_jax.studies.run_log import RunLog, read_all
 
@@ -26,20 +26,38 @@ class Trial(NamedTuple):
     within: int
 
 
-def cells(folders: Sequence[pathlib.Path]) -> tuple[dict[str, str], bool]:
-    """{name: command} of the cells at 1 and 0.2, and whether a form of the trial kept 1.
+def cells(trial: str, folders: Sequence[pathlib.Path]) -> dict[str, str]:
+    """{name: command} of the cells of `trial`."""
+    logs = read_all(folders)
+    return _with_multiplier(logs) if trial == "multiplier" else _with_trust_region(logs)
 
-    The rule: three of four seeds within 1 at a mean reward of at least 1,220, and of these forms the lowest mean cost.
+
+def _with_multiplier(logs: Sequence[RunLog]) -> dict[str, str]:
+    """Of the half-lives with mean costs of at most 0.7 at a limit of 1 and 0.15 at 0.2 the one with the highest reward
+    at 1; if none has, the one with the least sum of cost divided by limit.
     """
-    trials = {log.settings["kl_limit"]: _trial(log) for log in read_all(folders)}
+    trials: dict[float, dict[float, Trial]] = {}
+    for log in logs:
+        trials.setdefault(float(log.settings["kl_half_life"]), {})[float(log.cost_limit)] = _trial(log)
     print(trials, flush=True)
-    kept = [kl_limit for kl_limit, trial in trials.items() if trial.within >= 3 and trial.reward >= 1220]
-    if kept:
-        best = min(kept, key=lambda kl_limit: trials[kl_limit].cost)
-        start = f".ci/lease/macpo_shrink.py {ANT} {FORM} --kl-limit={best:g}"
+    meet = [half_life for half_life, at in trials.items() if at[1.0].cost <= 0.7 and at[0.2].cost <= 0.15]
+    if meet:
+        best = max(meet, key=lambda half_life: trials[half_life][1.0].reward)
     else:
-        start = f"-m pmt_jax {ANT} {AT_TEN}"
-    return {f"limits/macpo-{limit}": f"{start} --seed=440 --cost-limit={limit}" for limit in ("1", "0.2")}, bool(kept)
+        best = min(trials, key=lambda half_life: sum(one.cost / limit for limit, one in trials[half_life].items()))
+    return {name: f"{command} --kl-half-life={best:g}" for name, command in WITH_MULTIPLIER.items()}
+
+
+def _with_trust_region(logs: Sequence[RunLog]) -> dict[str, str]:
+    """Of the forms with a mean reward of at least 1,220 (of all, if none has) the one with the most seeds within 1;
+    if equal, the lowest mean cost.
+    """
+    trials = {(str(log.settings["method"]), float(log.settings["kl_limit"])): _trial(log) for log in logs}
+    print(trials, flush=True)
+    earn = [form for form, trial in trials.items() if trial.reward >= 1220] or list(trials)
+    method, kl_limit = min(earn, key=lambda form: (-trials[form].within, trials[form].cost))
+    form = f"--method={method} --kl-limit={kl_limit:g}"
+    return {name: f"{MACPO[method]} {command} {form}" for name, command in WITH_TRUST_REGION.items()}
 
 
 def _trial(log: RunLog) -> Trial:
@@ -51,5 +69,5 @@ def _trial(log: RunLog) -> Trial:
 
 
 if __name__ == "__main__":
-    for name, command in cells([pathlib.Path(folder) for folder in sys.argv[1:]])[0].items():
+    for name, command in cells(sys.argv[1], [pathlib.Path(folder) for folder in sys.argv[2:]]).items():
         print(name, command)

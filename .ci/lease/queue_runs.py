@@ -1,6 +1,6 @@
 """Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
 
-When its TRIAL has ended, the cells whose settings it chooses come next (choose.py).
+When one of its TRIALS has ended, the cells whose settings it chooses come next (choose.py); when all have, its LATER.
 """
 
 from __future__ import annotations
@@ -60,32 +60,28 @@ def room(running: list[Running], next_run: str) -> int | None:
     return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= jobs.PROGRAMS else None
 
 
-def with_cells(queue: list[Job]) -> list[Job]:
-    """The queue with the cells that the trial chooses; without them if it cannot be read, as the others shall run.
-
-    If its form kept the limit, that cell comes first, and the tighter one after the cells that are left.
-    """
+def chosen(trial: str) -> list[Job]:
+    """The cells that a trial chooses; none if it cannot be read, as the others shall run."""
     try:
-        found, kept = choose.cells([OUT / "runs" / name for name in jobs.TRIAL])
+        return list(choose.cells(trial, [OUT / "runs" / name for name in jobs.TRIALS[trial]]).items())
     except Exception as error:
         log("no cells:", repr(error))
-        return queue
-    first, second = found.items()
-    others = [job for job in queue if job[0] in jobs.CELLS]
-    rest = [job for job in queue if job[0] not in jobs.CELLS]
-    return [first, *others, second, *rest] if kept else [*queue, first, second]
+        return []
 
 
 def main() -> None:
-    queue, running, awaited = list(jobs.JOBS.items()), list[Running](), set(jobs.TRIAL)
+    queue, running = list(jobs.JOBS.items()), list[Running]()
+    awaited = {trial: set(names) for trial, names in jobs.TRIALS.items()}
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-                if name in awaited:
-                    awaited.remove(name)
-                    queue = queue if awaited else with_cells(queue)
+                for trial in [trial for trial, names in awaited.items() if name in names]:
+                    awaited[trial].remove(name)
+                    if not awaited[trial]:
+                        del awaited[trial]
+                        queue = [*chosen(trial), *queue, *(() if awaited else jobs.LATER.items())]
         if queue and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
