@@ -37,13 +37,24 @@ WITH_MULTIPLIER = {
     f"limits/{method}": f"-m pmt_jax {CELLS} --seeds=20 --method={method} {RELATIVE} --set cost_limit=0.2,1,10"
     for method in ("f4sg", "mappo_l")
 } | {
-    "limits/r4sg": f"-m pmt_jax {CELLS} --seeds=10 --method=r4sg {RELATIVE} --set cost_limit=0.2,1,10",
+    "limits/r4sg": f"-m pmt_jax {CELLS} --seeds=10 --method=r4sg {RELATIVE} --set cost_limit=0.2,1,10,25",
     "limits/pid": f"-m pmt_jax {CELLS} --seeds=10 --method=mappo_l {RELATIVE} --lambda-rule=pid --lambda-kp=0.5"
-    " --set cost_limit=0.2,1,10",
+    " --set cost_limit=0.2,1,10,25",
+    "limits/mappo_l-25": f"-m pmt_jax {CELLS} --seeds=10 --method=mappo_l {RELATIVE} --set cost_limit=25",
+    "limits/f4sg-25": f"-m pmt_jax {CELLS} --seeds=10 --method=f4sg {RELATIVE} --set cost_limit=25",
 }
 WITH_TRUST_REGION = {
-    f"limits/macpo-{name}": f"{CELLS} --seeds=20 {LOWERED} --set cost_limit={limits}"
-    for name, limits in {"1-0.2": "0.2,1", "10": "10"}.items()
+    f"limits/macpo-{name}": f"{CELLS} {LOWERED} {limits}"
+    for name, limits in {
+        "1-0.2": "--seeds=20 --set cost_limit=0.2,1",
+        "10": "--seeds=20 --set cost_limit=10",
+        "25": "--seeds=10 --set cost_limit=25",
+    }.items()
+}
+# The other ant at 10, with the settings of the cell at 10 before the batch was cut.
+OTHER_ANT = {
+    "limits/macpo_4x2": "-m pmt_jax train paper/ant_4x2 --method=macpo --limit-lr=0.1 --kl-limit=0.03 --seed=440"
+    " --seeds=20 --cost-limit=10 --cost-margin=0.5"
 }
 
 # Table 1 of ant_2x4 where nobody can cheat (bench/sweeps/walls.toml); ten programs are about a lease of one GPU.
@@ -62,9 +73,11 @@ FEAR = {
 }
 
 # What a GPU holds at a time, and how much of it a run counts as; the others count as 1. With one GPU, VELOCITY first.
-# After these: limits of 25, the table of limits on the other ant.
+# After these: the table of limits on the other ant.
 PROGRAMS = 2
-BIG = ("limits/f4sg", "limits/mappo_l", *WITH_TRUST_REGION, *(name for trial in TRIALS.values() for name in trial))
-WEIGHTS = dict.fromkeys(VELOCITY, 0.5) | dict.fromkeys(BIG, 2)
+BIG = ("limits/f4sg", "limits/mappo_l", "limits/macpo-1-0.2", "limits/macpo-10", *OTHER_ANT)
+WEIGHTS = dict.fromkeys(VELOCITY, 0.5) | dict.fromkeys(WALLS, 0.66)
+WEIGHTS |= dict.fromkeys((*BIG, *(name for trial in TRIALS.values() for name in trial)), 2)
 JOBS = {name: command for trial in TRIALS.values() for name, command in trial.items()} | VELOCITY
-LATER = WALLS | FEAR  # when all trials have ended
+BESIDE = OTHER_ANT | WALLS  # while trials run, if there are GPUs for it, else after them
+LATER = FEAR

@@ -1,6 +1,7 @@
 """Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
 
-When one of its TRIALS has ended, the cells whose settings it chooses come next (choose.py); when all have, its LATER.
+When one of its TRIALS has ended, the cells whose settings it chooses come next (choose.py); when all have, what is
+LATER. With more than four GPUs what is BESIDE the trials begins at once.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import jobs
 HERE = pathlib.Path(__file__).parent
 SMOKE = "--smoke" in sys.argv
 OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
-GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
+GPUS = 8 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
 Job = tuple[str, str]
@@ -70,7 +71,8 @@ def chosen(trial: str) -> list[Job]:
 
 
 def main() -> None:
-    queue, running = list(jobs.JOBS.items()), list[Running]()
+    at_once, later = (jobs.BESIDE, jobs.LATER) if GPUS > 4 else ({}, jobs.BESIDE | jobs.LATER)
+    queue, running = [*jobs.JOBS.items(), *at_once.items()], list[Running]()
     awaited = {trial: set(names) for trial, names in jobs.TRIALS.items()}
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
@@ -81,7 +83,7 @@ def main() -> None:
                     awaited[trial].remove(name)
                     if not awaited[trial]:
                         del awaited[trial]
-                        queue = [*chosen(trial), *queue, *(() if awaited else jobs.LATER.items())]
+                        queue = [*chosen(trial), *queue, *(() if awaited else later.items())]
         if queue and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))
