@@ -1,8 +1,4 @@
-"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
-
-When one of its TRIALS has ended, the cells whose settings it chooses come next (choose.py); when all have, what is
-LATER. With more than four GPUs what is BESIDE the trials begins at once.
-"""
+"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved."""
 
 from __future__ import annotations
 
@@ -13,16 +9,14 @@ import subprocess
 import sys
 import time
 
-import choose
 import jobs
 
 HERE = pathlib.Path(__file__).parent
 SMOKE = "--smoke" in sys.argv
 OUT = pathlib.Path("/tmp/smoke" if SMOKE else "/tmp/runs")
-GPUS = 8 if SMOKE else len((OUT / "gpus").read_text().splitlines())
+GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
-Job = tuple[str, str]
 Running = tuple[int, str, subprocess.Popen[bytes]]
 ENVIRONMENT = {  # beside what setup.sh exports
     "PYTHONUNBUFFERED": "1",
@@ -61,29 +55,13 @@ def room(running: list[Running], next_run: str) -> int | None:
     return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= jobs.PROGRAMS else None
 
 
-def chosen(trial: str) -> list[Job]:
-    """The cells that a trial chooses; none if it cannot be read, as the others shall run."""
-    try:
-        return list(choose.cells(trial, [OUT / "runs" / name for name in jobs.TRIALS[trial]]).items())
-    except Exception as error:
-        log("no cells:", repr(error))
-        return []
-
-
 def main() -> None:
-    at_once, later = (jobs.BESIDE, jobs.LATER) if GPUS > 4 else ({}, jobs.BESIDE | jobs.LATER)
-    queue, running = [*jobs.JOBS.items(), *at_once.items()], list[Running]()
-    awaited = {trial: set(names) for trial, names in jobs.TRIALS.items()}
+    queue, running = list(jobs.JOBS.items()), list[Running]()
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-                for trial in [trial for trial, names in awaited.items() if name in names]:
-                    awaited[trial].remove(name)
-                    if not awaited[trial]:
-                        del awaited[trial]
-                        queue = [*chosen(trial), *queue, *(() if awaited else later.items())]
         if queue and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
             running.append((free, name, start(free, name, command.split())))

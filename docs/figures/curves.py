@@ -34,6 +34,7 @@ FIGURES = {
     "velocity_ant_2x4_limit_02": "velocity_ant_2x4_limit_02_h200",
     "velocity_half_cheetah_2x3": "velocity_half_cheetah_2x3_h200",
     "velocity_half_cheetah_2x3_limit_02": "velocity_half_cheetah_2x3_limit_02_h200",
+    "velocity_fear_half_cheetah_2x3": "velocity_fear_half_cheetah_2x3_h200",
     "velocity_half_cheetah_6x1": "velocity_half_cheetah_6x1_h200",
     "velocity_hopper_3x1": "velocity_hopper_3x1_h200",
     "velocity_humanoid_9_8": "velocity_humanoid_9_8_h200",
