@@ -21,7 +21,7 @@ NUMBER = rf"(?<![\w.,])(?<![\w.]-){DIGITS}(?!\w)"  # its sign does not count
 
 # Numbers of pages that no block has, and what they are: none is a measurement.
 STATED: dict[str, dict[str, str]] = {
-    "README.md": {"versions of Python": "3.11 3.13", "band": "0.95 1.05", "bound of a test": "5e-5", "a limit": "0.2"},
+    "README.md": {"versions of Python": "3.11 3.13", "band": "0.95 1.05", "bound of a test": "5e-5"},
     "appendix/benchmarks.md": {"exit code": "130", "unit": "1e9", "day": "11", "version": "0.14"},
     "howto/compare.md": {"level of intervals": "95"},
     "howto/evaluate.md": {"level of intervals": "95"},
