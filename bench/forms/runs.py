@@ -13,7 +13,7 @@ import numpy as np
 from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
-from pmt_jax.studies import plot, table
+from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import mean_interval, u_test
@@ -88,7 +88,7 @@ def _compact(log: RunLog) -> Run:
         "seconds": float(np.nanmax(log.metrics["seconds"])),
         "versions": log.versions,
         "commit": (records.git("rev-parse", "--short", "HEAD") or "unknown").strip(),
-        "config": (log.folder / "config.toml").read_text(),
+        "config": program_folder.settings_file(log.folder).read_text(),
     }
 
 

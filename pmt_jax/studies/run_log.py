@@ -18,6 +18,7 @@ import numpy as np
 from ..config.settings import Config, load_config
 from ..errors import UsageError
 from ..files import read_rows
+from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
@@ -158,7 +159,7 @@ def _averaged(values: np.ndarray, starts: list[int]) -> np.ndarray:
 
 
 def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[RunLog]:
-    """The runs among and below `paths`; other folders are left out with a note.
+    """The runs among and below `paths`, also the points of a sweep under way; other folders are left out with a note.
 
     Raises:
       UsageError: a path does not exist, none of them holds a run with metrics, or a run cannot be read.
@@ -170,8 +171,9 @@ def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[Run
             raise UsageError(f"{path} is a pretrained policy, which has no metrics of its training; name a run folder")
         if not path.exists():
             raise UsageError(f"{path} is not a run folder: there is no such folder")
-        folders = list(_folders(path))
-        if not folders:
+        folders, begun = list(_folders(path)), _under_way(path, note)
+        logs += [log for log in begun if all(log.folder != other.folder for other in logs)]
+        if not folders and not begun:
             reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
         for folder in folders:
             if any(log.folder == folder for log in logs):
@@ -213,8 +215,26 @@ def read(folder: pathlib.Path) -> RunLog | None:
         rows = read_rows(metrics, missing_ok=False)
     except OSError as error:
         raise UsageError(f"{folder} has no metrics: cannot read its metrics.jsonl ({error.strerror})") from None
-    if not rows:
-        return None
+    return _log(folder, rows, metrics, _config(folder / "config.toml")) if rows else None
+
+
+def _under_way(path: pathlib.Path, note: Say) -> list[RunLog]:
+    """The points of sweeps at and below `path` that have not ended, as far as they are; each names its later folder."""
+    found = []
+    for group in sorted(path.rglob(".group-*")):
+        metrics = group / "run" / "metrics.jsonl"
+        rows = program_folder.rows(group) if metrics.is_file() else {}
+        configs = program_folder.points(group)
+        missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
+        logs = [_log(group.parent / name, rows[name], metrics, configs[name]) for name in missing]
+        if logs:
+            note(f"not ended: {len(logs)} point(s) of {group.parent}, read at step {logs[0].steps[-1]:,}")
+        found += logs
+    return found
+
+
+def _log(folder: pathlib.Path, rows: Sequence[dict[str, Any]], metrics: pathlib.Path, config: Config) -> RunLog:
+    """The run in `folder`, of its rows in the file `metrics`."""
     for row in rows:
         _check(row, metrics)
     steps, seeds = (sorted({row[name] for row in rows}) for name in ("step", "seed"))
@@ -224,11 +244,11 @@ def read(folder: pathlib.Path) -> RunLog | None:
         task=last["task"],
         method=last["method"],
         cost_limit=last["cost_limit"],
-        settings=flat(_config(folder / "config.toml")) | _changes(folder),
+        settings=flat(config) | _changes(metrics.parent),
         seeds=tuple(seeds),
         steps=np.array(steps),
         metrics=_metrics(rows, seeds, steps, metrics),
-        versions=_versions(folder),
+        versions=_versions(metrics.parent),
         broken={row["seed"]: row["step"] for row in reversed(rows) if row.get("broken") is not None},
     )
 

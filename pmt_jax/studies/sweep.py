@@ -11,21 +11,21 @@ import json
 import pathlib
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from ..config.settings import HYPER_FIELDS, Config, differences, load_config, to_toml
 from ..errors import UsageError
-from ..files import read_rows, writing
+from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
 from ..training import trainer
 from ..training.checkpoint import Checkpoints
 from ..training.claims import claim
 from ..training.run_folder import Say, load_saved
-from . import table, workers
+from . import program_folder, table, workers
 from .points import Part, Points, drawn
 from .rows import rows
 from .run_log import read_all
@@ -176,7 +176,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
     left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
     for folder in begun:
-        group = _points(folder)
+        group = program_folder.points(folder)
         wanted = all(repr(points.get(name)) == repr(config) for name, config in group.items())
         if wanted and any(name in left for name in group):
             left = {name: config for name, config in left.items() if name not in group}
@@ -190,15 +190,9 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def _points(folder: pathlib.Path) -> Points:
-    """The points of a program's hidden folder."""
-    files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
-    return {file.stem: load_config(file) for file in files}
-
-
 def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
     """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
-    group = _points(folder)
+    group = program_folder.points(folder)
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])
     settings = [dataclasses.replace(setup, config=config).hyper for config in configs]
@@ -219,14 +213,13 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
-    rows = read_rows(folder / "run" / "metrics.jsonl")
+    rows = program_folder.rows(folder)
     for number, (name, config) in enumerate(group.items()):
         if (out / name / "config.toml").is_file():
             continue
-        first = number * config.seeds  # of its trials, whose rows know a rounded limit
+        first = number * config.seeds  # of its trials
         limit = dataclasses.replace(setup, config=config).cost_limit
-        theirs = [row for row in rows if first <= row["seed"] < first + config.seeds]
-        mine = [row | {"cost_limit": limit} | _own_seed(row, config.seed - first) for row in theirs]
+        mine = [row | {"cost_limit": limit} for row in rows[name]]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
@@ -241,10 +234,3 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     shutil.rmtree(done, ignore_errors=True)
     folder.rename(done)
     shutil.rmtree(done, ignore_errors=True)
-
-
-def _own_seed(row: dict[str, Any], offset: int) -> dict[str, Any]:
-    """What a row says of its trial, said of the point's seed: in `broken`, too."""
-    trial, broken = row["seed"], row.get("broken")
-    seed = trial + offset
-    return {"seed": seed, "broken": broken and broken.replace(f"of seed {trial} ", f"of seed {seed} ")}

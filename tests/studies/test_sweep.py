@@ -15,7 +15,7 @@ import tomli_w
 from pmt_jax import load_config
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
-from pmt_jax.studies import reproduce, sweep, table
+from pmt_jax.studies import reproduce, run_log, sweep, table
 from pmt_jax.studies.points import Part, make_points
 from pmt_jax.training import checkpoint
 from pmt_jax.training.loggers import Jsonl
@@ -105,6 +105,16 @@ def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path:
         code, out, _ = cli(*COMMAND, tmp_path)
     assert code == 130 and "Continue with: the same command" in out
     assert [p.name for p in tmp_path.iterdir()] == [".group-1"]
+    notes: list[str] = []
+    begun = run_log.read_all([tmp_path], notes.append)
+    assert notes == [f"not ended: 2 point(s) of {tmp_path}, read at step 200"]
+    assert [log.folder for log in begun] == [tmp_path / name for name in NAMES]
+    for log, name in zip(begun, NAMES, strict=True):
+        ended = run_log.read(swept / name)
+        assert ended and (log.identity, log.seeds, log.versions) == (ended.identity, ended.seeds, ended.versions)
+        for metric in set(log.metrics) - {"seconds"}:
+            np.testing.assert_array_equal(log.metrics[metric], ended.until(200).metrics[metric])
+    assert cli("table", tmp_path)[0] == 0
     code, out, _ = cli(*COMMAND, tmp_path)
     assert code == 0 and "resuming after 200 steps" in out
     for name in NAMES:

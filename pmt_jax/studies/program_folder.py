@@ -1,0 +1,48 @@
+"""A sweep's hidden folder `.group-N`: a program, in which several points train side by side as the trials of one run.
+
+.group-1/points/NAME.toml    the settings of each point
+.group-1/run/                their common run folder, which counts the seeds of all points through from 0
+"""
+
+from __future__ import annotations
+
+import math
+import pathlib
+from typing import Any
+
+from ..config.settings import load_config
+from ..files import read_rows
+from .points import Points
+
+
+def points(folder: pathlib.Path) -> Points:
+    """The points of a program, in the order of their trials."""
+    files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
+    return {file.stem: load_config(file) for file in files}
+
+
+def settings_file(point: pathlib.Path) -> pathlib.Path:
+    """Where the settings of a sweep's point are: in its own folder, or with the program that trains it."""
+    begun = (group / "points" / f"{point.name}.toml" for group in point.parent.glob(".group-*"))
+    return next((file for file in (point / "config.toml", *begun) if file.is_file()), point / "config.toml")
+
+
+def rows(folder: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
+    """{point: rows}, the metrics so far of each point, as a run of its own would have written them."""
+    every = read_rows(folder / "run" / "metrics.jsonl")
+    found, first = {}, 0
+    for name, config in points(folder).items():
+        trials, limit = range(first, first + config.seeds), config.cost_limit
+        # Rows of several points know a limit in single precision only.
+        own = {"cost_limit": limit} if isinstance(limit, float) and not math.isnan(limit) else {}
+        theirs = [row for row in every if row.get("seed") in trials]
+        found[name] = [row | own | _own_seed(row, config.seed - first) for row in theirs]
+        first = trials.stop
+    return found
+
+
+def _own_seed(row: dict[str, Any], offset: int) -> dict[str, Any]:
+    """What a row says of its trial, said of the point's seed: in `broken`, too."""
+    trial, broken = row["seed"], row.get("broken")
+    seed = trial + offset
+    return {"seed": seed, "broken": broken and broken.replace(f"of seed {trial} ", f"of seed {seed} ")}
