@@ -15,10 +15,14 @@ from ..files import read_rows
 from .points import Points
 
 
+def point_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The settings of each point of a program, in the order of their trials."""
+    return sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
+
+
 def points(folder: pathlib.Path) -> Points:
-    """The points of a program, in the order of their trials."""
-    files = sorted((folder / "points").glob("*.toml"), key=lambda file: file.stem)
-    return {file.stem: load_config(file) for file in files}
+    """The points of a program, in the same order."""
+    return {file.stem: load_config(file) for file in point_files(folder)}
 
 
 def settings_file(point: pathlib.Path) -> pathlib.Path:
@@ -27,11 +31,11 @@ def settings_file(point: pathlib.Path) -> pathlib.Path:
     return next((file for file in (point / "config.toml", *begun) if file.is_file()), point / "config.toml")
 
 
-def rows(folder: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
-    """{point: rows}, the metrics so far of each point, as a run of its own would have written them."""
+def rows(folder: pathlib.Path, group: Points) -> dict[str, list[dict[str, Any]]]:
+    """{point: rows}, the metrics so far of each point of a program, as a run of its own would have written them."""
     every = read_rows(folder / "run" / "metrics.jsonl")
     found, first = {}, 0
-    for name, config in points(folder).items():
+    for name, config in group.items():
         trials, limit = range(first, first + config.seeds), config.cost_limit
         # Rows of several points know a limit in single precision only.
         own = {"cost_limit": limit} if isinstance(limit, float) and not math.isnan(limit) else {}

@@ -223,8 +223,8 @@ def _under_way(path: pathlib.Path, note: Say) -> list[RunLog]:
     found = []
     for group in sorted(path.rglob(".group-*")):
         metrics = group / "run" / "metrics.jsonl"
-        rows = program_folder.rows(group) if metrics.is_file() else {}
-        configs = program_folder.points(group)
+        configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
+        rows = program_folder.rows(group, configs)
         missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
         logs = [_log(group.parent / name, rows[name], metrics, configs[name]) for name in missing]
         if logs:

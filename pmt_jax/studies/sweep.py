@@ -213,12 +213,12 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
-    rows = program_folder.rows(folder)
+    rows = program_folder.rows(folder, group)
     for number, (name, config) in enumerate(group.items()):
         if (out / name / "config.toml").is_file():
             continue
         first = number * config.seeds  # of its trials
-        limit = dataclasses.replace(setup, config=config).cost_limit
+        limit = dataclasses.replace(setup, config=config).cost_limit  # the task's own, too, not rounded
         mine = [row | {"cost_limit": limit} for row in rows[name]]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)

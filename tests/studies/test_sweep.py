@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pathlib
+import re
 import shutil
 import signal
 
@@ -115,6 +116,12 @@ def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path:
         for metric in set(log.metrics) - {"seconds"}:
             np.testing.assert_array_equal(log.metrics[metric], ended.until(200).metrics[metric])
     assert cli("table", tmp_path)[0] == 0
+    file = tmp_path / ".group-1" / "points" / f"{NAMES[0]}.toml"
+    right = file.read_text()
+    file.write_text(re.sub("^gamma = .*", "gamma = 7", right, flags=re.MULTILINE))
+    code, _, err = cli("table", tmp_path)
+    assert code == 2 and f"{file}: gamma must lie in [0, 1], not 7" in err
+    file.write_text(right)
     code, out, _ = cli(*COMMAND, tmp_path)
     assert code == 0 and "resuming after 200 steps" in out
     for name in NAMES:
