@@ -47,5 +47,5 @@ WALLS = {
 # What a GPU holds at a time, and how much of it a run counts as; the others count as 1. A program of 60 x 384 ants
 # makes 430,000 steps/s if it is alone.
 PROGRAMS = 2
-WEIGHTS = dict.fromkeys((*CELLS, *MACPO, *CONTROL, *OTHER_ANT), 2) | dict.fromkeys(WALLS, 0.66)
-JOBS = CELLS | MACPO | OTHER_ANT | CONTROL | LEFT | WALLS
+WEIGHTS = dict.fromkeys((*CELLS, *CONTROL, *OTHER_ANT), 2) | dict.fromkeys(WALLS, 0.66)
+JOBS = CELLS | CONTROL | MACPO | OTHER_ANT | WALLS | LEFT

@@ -50,9 +50,10 @@ def start(gpu: int, name: str, command: list[str]) -> subprocess.Popen[bytes]:
 
 
 def room(running: list[Running], next_run: str) -> int | None:
-    """The GPU for the next run, which has the least to do; None if no GPU has room for it."""
+    """The fullest GPU that has room for the next run, so that a large one finds an empty GPU; None if none has."""
+    weight = jobs.WEIGHTS.get(next_run, 1)
     at = [sum(jobs.WEIGHTS.get(name, 1) for there, name, _ in running if there == gpu) for gpu in range(GPUS)]
-    return at.index(min(at)) if min(at) + jobs.WEIGHTS.get(next_run, 1) <= jobs.PROGRAMS else None
+    return max((gpu for gpu in range(GPUS) if at[gpu] + weight <= jobs.PROGRAMS), key=at.__getitem__, default=None)
 
 
 def main() -> None:
