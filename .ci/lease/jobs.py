@@ -41,11 +41,11 @@ LEFT = {
 WALLS = {
     f"walls_4x2/{walls}-{method}": f"-m pmt_jax train paper/ant_4x2 --method={method} --env walls={walls}"
     for walls in ("costly", "solid")
-    for method in ("macpo", "f4sg", "mappo_l", "happo", "mappo")
+    for method in ("mappo_l", "f4sg", "mappo", "happo", "macpo")
 }
 
 # What a GPU holds at a time, and how much of it a run counts as; the others count as 1. A program of 60 x 384 ants
 # makes 430,000 steps/s if it is alone.
 PROGRAMS = 2
-WEIGHTS = dict.fromkeys((*CELLS, *CONTROL, *OTHER_ANT), 2) | dict.fromkeys(WALLS, 0.66)
-JOBS = CELLS | CONTROL | MACPO | OTHER_ANT | WALLS | LEFT
+WEIGHTS = dict.fromkeys((*CELLS, *OTHER_ANT), 2) | dict.fromkeys(CONTROL, 1.5) | dict.fromkeys(WALLS, 0.5)
+JOBS = CELLS | CONTROL | MACPO | WALLS | OTHER_ANT | LEFT
