@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -57,6 +58,8 @@ def room(running: list[Running], next_run: str) -> int | None:
 
 
 def main() -> None:
+    if SMOKE:
+        shutil.rmtree(OUT, ignore_errors=True)
     queue, running = list(jobs.JOBS.items()), list[Running]()
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
