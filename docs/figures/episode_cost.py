@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--measure", action="store_true", help="evaluate the pretrained policies first")
     if parser.parse_args().measure:
         use_cache()
-        found = {task: {method: measure(task, method) for method in style.NAMES} for task in WINDOWS}
+        found = {task: {method: measure(task, method) for method in METHOD_COLOURS} for task in WINDOWS}
         STORED.write_text(json.dumps(found) + "\n")
     draw(json.loads(STORED.read_text()), PICTURE)
     print(f"docs/{PICTURE.name}")

@@ -23,9 +23,10 @@ from bench import compare, measure, once, plain, records, render, runner, subste
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.forms import pages, runs, tables
-from docs.figures import ant_paths, curves, style
+from docs.figures import ant_paths, curves, episode_cost, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError
+from pmt_jax.policies import hub
 from pmt_jax.studies import points, table
 from pmt_jax.studies.rows import rows
 from pmt_jax.studies.run_log import read_all
@@ -485,3 +486,19 @@ def test_paths_of_ants_are_stored_and_drawn(
     with pytest.raises(SystemExit, match="2"):
         ant_paths.main(["runs/lane", *files])
     assert "paths are drawn of ants only" in capsys.readouterr().err
+
+
+def test_costs_through_an_episode_are_measured_of_policies_that_exist(monkeypatch, tmp_path: pathlib.Path):
+    asked = []
+
+    def measure(task: str, method: str) -> list[float]:
+        asked.append(f"hub:{task}/{method}")
+        return [0.0, 1.0]
+
+    monkeypatch.setattr(episode_cost, "measure", measure)
+    monkeypatch.setattr(episode_cost, "STORED", tmp_path / "costs.json")
+    monkeypatch.setattr(episode_cost, "PICTURE", tmp_path / "costs.png")
+    monkeypatch.setattr(sys, "argv", ["episode_cost", "--measure"])
+    episode_cost.main()
+    assert len(asked) == 14 and set(asked) <= set(hub.names())  # of two tasks, seven methods each
+    assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
