@@ -5,8 +5,9 @@ from __future__ import annotations
 END = 1630.0  # seconds after asking
 
 # Limits with a faster multiplier (docs/appendix/preregistration.md): two forms, 20 seeds a limit on ant 2x4.
-PID = "--lambda-rule=pid --lambda-kp=0.5 --lambda-unit=relative --lambda-lr=0.008 --lambda-max=1000"
-PID += " --cost-estimate=average --cost-std-floor=0.1 --cost-margin=0.5 --episode-starts=spread"
+INTEGRAL = "--lambda-unit=relative --lambda-lr=0.008 --lambda-max=1000"
+INTEGRAL += " --cost-estimate=average --cost-std-floor=0.1 --cost-margin=0.5 --episode-starts=spread"
+PID = f"{INTEGRAL} --lambda-rule=pid --lambda-kp=0.5"
 FORMS = {"a": PID, "b": f"{PID} --kl-half-life=5e6"}
 CELLS = {
     f"limits/{form}-{method}": f"-m pmt_jax sweep paper/ant_2x4 --method={method} --seed=600 --seeds=20 {settings}"
@@ -22,7 +23,7 @@ OTHER_ANT = {
     f"limits_4x2/{name}": f"-m pmt_jax sweep paper/ant_4x2 --method={method} {ALL_LIMITS} {form}"
     for name, method, form in (
         ("mappo_l", "mappo_l", PID),
-        ("integral", "mappo_l", PID.replace("--lambda-kp=0.5", "--lambda-kp=0")),
+        ("integral", "mappo_l", INTEGRAL),
         ("f4sg", "f4sg", PID),
         ("r4sg", "r4sg", PID),
         ("macpo", "macpo", LOWERED),
