@@ -159,9 +159,9 @@ class Hyper:
         0.5, "the weight on the ratio stays within 1 +- kappa * clip; inf for no bound", NOT_NEGATIVE_OR_INF
     )
     limit_lr: float = constraint(
-        0.0, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", NOT_NEGATIVE
+        0.0, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", SHARE
     )
-    kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", NOT_NEGATIVE_OR_INF)
+    kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
     first_step: float = constraint(1.0, "first step of MACPO's line search, as a share of the full step", NOT_NEGATIVE)
     step_decay: float = constraint(0.8, "factor between one step of the line search and the next", NOT_NEGATIVE)
@@ -414,6 +414,16 @@ def _validate(config: Config) -> None:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
     if config.lambda_unit == "relative" and not config.lambda_init:
         raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
+    if config.cost_seen <= config.cost_false:
+        raise UsageError(
+            f"cost_seen = {config.cost_seen} must lie above cost_false = {config.cost_false}, or a costly step is felt "
+            "no more often than a safe one"
+        )
+    if config.cost_estimate == "critic" and config.gamma == 1:
+        raise UsageError(
+            "cost_estimate = critic takes the cost of a step for (1 - gamma) times the value; set gamma below 1 or take "
+            "another cost_estimate"
+        )
     _validate_sizes(config)
 
 

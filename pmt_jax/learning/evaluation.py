@@ -14,7 +14,7 @@ import scipy.special
 
 from .. import tasks
 from . import sharding
-from .rollout import Feel, is_within
+from .rollout import Feel, cost_beyond
 from .setup import Setup
 from .types import ActingState, Hyper, Metrics, Tag
 
@@ -66,8 +66,8 @@ def evaluate(
     count = setup.vector.spec.num_costs
     names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
     costs = jnp.stack([metrics[name] for name in names], axis=-1)
-    within = is_within(costs, metrics["true_episode_cost"][:, None], felt, setup.vector.horizon)
-    return metrics | {"within_limit": within.astype(costs.dtype)}
+    beyond = cost_beyond(costs, metrics["true_episode_cost"][:, None], felt, setup.vector.horizon)
+    return metrics | {"within_limit": jnp.all(beyond == 0, axis=-1).astype(costs.dtype)}
 
 
 def play(

@@ -136,10 +136,9 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch),
-        "within_limit": rollout.finished_mean(batch, rollout.within_limit(batch, hyper, setup.vector.horizon)),
+        **rollout.limits_kept(batch, hyper, setup.vector.horizon),
         "lambda": weigh(multiplier).mean(),
         "cost_excess": cost_excess.mean(),
-        "cost_beyond": jnp.maximum(episode_cost - jnp.asarray(hyper.cost_limit), 0.0).sum(-1).mean(),
         **{f"critic/{k}": x for k, x in critic_metrics.items()},
         **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
         **{f"actor/{k}": x for k, x in actor_metrics.items()},

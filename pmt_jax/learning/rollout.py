@@ -125,18 +125,28 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
     return jnp.sum(x * finished, (0, 1)) / finished.sum()  # 0 / 0 is nan
 
 
-def within_limit(batch: Batch, hyper: Hyper, horizon: int) -> jax.Array:
-    """Whether an episode's cost up to a step is within its limit, [T, B] bool."""
-    return is_within(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper, horizon)
+def limits_kept(batch: Batch, hyper: Hyper, horizon: int) -> dict[str, jax.Array]:
+    """How the episodes that ended kept their limits, scalars; nan if none ended.
+
+    within_limit: share of them whose cost is within the limit, of several costs each. episode_cost_beyond: their mean
+    cost beyond it, 0 of an episode within it, in the limit's unit; of several costs the sum.
+    """
+    beyond = cost_beyond(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper, horizon)
+    return {
+        "within_limit": finished_mean(batch, jnp.all(beyond == 0, axis=-1)),
+        "episode_cost_beyond": finished_mean(batch, beyond.sum(-1)),
+    }
 
 
-def is_within(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) -> jax.Array:
-    """Whether episode costs [..., K] are within their limits, [...] bool: the true one, of several each felt one.
+def cost_beyond(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) -> jax.Array:
+    """How far episode costs [..., K] are beyond their limits, 0 within: the true one, of several each felt one.
 
     The limit is on what is felt, so a true cost counts as what it is expected to be felt as, see `Setup.limits`.
     """
     cost = felt if felt.shape[-1] > 1 else hyper.cost_seen * true + hyper.cost_false * (horizon - true)
-    return jnp.all(cost <= jnp.asarray(hyper.cost_limit), axis=-1)
+    limit = jnp.asarray(hyper.cost_limit)
+    # Both are rounded to 32 bits, and a cost that is its limit must not be beyond it.
+    return jnp.where(cost > limit * (1 + 1e-6), cost - limit, 0.0)
 
 
 def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:

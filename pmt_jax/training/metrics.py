@@ -48,6 +48,9 @@ METRICS: dict[str, Metric] = {
     "within_limit": Metric(
         "", "share of the episodes that ended whose cost is within the limit, of several costs each"
     ),
+    "episode_cost_beyond": Metric(
+        "cost", "how far their cost is beyond the limit, 0 of one within it, mean over them; of several costs the sum"
+    ),
     "step_reward": Metric("reward", "reward of a control step"),
     "step_cost": Metric("cost", "cost of a control step, mean over agents"),
     "true_episode_cost": Metric("cost", "episode_cost before `cost_seen` and `cost_false`: what the costs were"),
@@ -56,7 +59,6 @@ METRICS: dict[str, Metric] = {
     "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
     "lambda": Metric("", "the multiplier, mean over agents and costs; of MACPO how far its limit is lowered, per step"),
     "cost_excess": Metric("cost per step", "how far the estimated episode cost is beyond the limit less `cost_margin`"),
-    "cost_beyond": Metric("cost", "how far it is beyond the limit itself, 0 within it; of several costs the sum"),
     "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),
     "critic/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
     "critic/explained_variance": Metric("", "1 - variance of the critic's error / variance of the returns"),

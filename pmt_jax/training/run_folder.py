@@ -28,7 +28,8 @@ from .checkpoint import Checkpoints
 from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length")  # --change keeps it
+# What --change keeps: who the run is, and what is read at its start only.
+IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 

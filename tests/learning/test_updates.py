@@ -263,22 +263,40 @@ def test_share_of_episodes_within_and_cost_beyond_the_limit():
     setup, _, batch = acted()
     cost = np.asarray(batch.true_episode_cost[-1, :, :, 0]).mean(-1)  # all episodes end with the batch
     for limit in np.median(cost), cost.max(), cost.min() - 1e-3:
-        share = rollout.finished_mean(batch, rollout.within_limit(batch, hyper_of(setup, limit), 25))
-        np.testing.assert_allclose(share, (cost <= np.float32(limit)).mean())
-    several = rollout.is_within(
-        jnp.asarray([[1.0, 2.0], [3.0, 0.0]]), jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]), 25
-    )
-    assert several.tolist() == [True, False]
-    assert rollout.is_within(jnp.ones((1, 1)), jnp.ones((1, 1)), hyper_of(setup, 0.5, cost_seen=0.5), 25).all()
+        kept = rollout.limits_kept(batch, hyper_of(setup, limit), 25)
+        np.testing.assert_allclose(kept["within_limit"], (cost <= np.float32(limit)).mean())
+        np.testing.assert_allclose(kept["episode_cost_beyond"], np.maximum(cost - limit, 0.0).mean(), rtol=1e-5)
+    costs = jnp.asarray([[1.0, 2.0], [3.0, 0.5]])
+    assert rollout.cost_beyond(costs, jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]), 25).tolist() == [[0, 0], [2, 0]]
     felt = make_setup(load_config("lane", cost_seen=0.5, cost_false=0.1))  # a limit of 1 of 25 steps
     true = jnp.asarray([[0.9], [1.1], [4.0]])
-    within = rollout.is_within(true, true, dataclasses.replace(felt.hyper, cost_limit=jnp.asarray(felt.limits)), 25)
-    assert within.tolist() == [True, False, False]
-    made = program("mappo_l")
-    start = made.init(made.setup.hyper, jax.random.key(0))
-    for limit in 3.0, 30.0:
-        _, metrics = made.step(made.hyper(cost_limit=limit), start)
-        np.testing.assert_allclose(metrics["cost_beyond"], max(metrics["episode_cost"] - limit, 0.0), rtol=1e-5)
+    beyond = rollout.cost_beyond(true, true, dataclasses.replace(felt.hyper, cost_limit=jnp.asarray(felt.limits)), 25)
+    np.testing.assert_allclose(beyond, [[0], [0.04], [1.2]], atol=1e-6)  # felt: 0.4 of each
+
+
+@pytest.mark.parametrize("seen", [0.1, 0.15, 0.3, 0.33, 0.36, 1.0])
+@pytest.mark.parametrize("limit", [1, 10, 25])
+def test_a_cost_that_is_its_limit_is_within_it(seen: float, limit: int):
+    """Both are rounded to 32 bits."""
+    setup = make_setup(load_config("lane", cost_seen=seen))
+    hyper = dataclasses.replace(setup.hyper, cost_limit=jnp.asarray(seen * limit, jnp.float32))
+    true = jnp.asarray([[limit - 1.0], [limit], [limit + 1.0]])
+    beyond = jax.jit(lambda hyper: rollout.cost_beyond(true, true, hyper, 1000))(hyper)
+    assert (beyond[:, 0] > 0).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("estimate", ["rate", *(pytest.param(x, marks=pytest.mark.full) for x in ("average", "critic"))])
+def test_the_cost_beyond_is_that_of_episodes_however_the_multiplier_estimates_it(estimate: str):
+    """Batches of a fifth of an episode: nan where none ended."""
+    config = load_config("lane", method="mappo", cost_estimate=estimate, **SMALL | {"rollout_length": 5})
+    setup = make_setup(config)
+    start = learner.init(setup, setup.hyper, jax.random.key(0))
+    _, metrics = jax.lax.scan(lambda state, _: learner.train_step(setup, setup.hyper, state), start, length=5)
+    ended = np.asarray(metrics["episodes"]) > 0
+    assert ended.tolist() == [False] * 4 + [True]
+    np.testing.assert_array_equal(np.isnan(metrics["episode_cost_beyond"]), ~ended)
+    least = metrics["episode_cost"][4] - setup.hyper.cost_limit
+    assert max(least, 0) <= metrics["episode_cost_beyond"][4] <= metrics["episode_cost"][4]
 
 
 def test_figures_of_episodes_count_finished_ones_only():

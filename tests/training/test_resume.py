@@ -230,6 +230,7 @@ def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Pat
     [
         (("--seed", 5), "--change cannot change seed; leave them as they are"),
         (("--rollout-length", 10), "--change cannot change rollout_length; leave them as they are"),
+        (("--episode-starts", "spread"), "--change cannot change episode_starts; leave them as they are"),
         pytest.param(("--steps", STEPS + 200, "--hidden", 16), "expected float32", marks=pytest.mark.full),
     ],
 )
