@@ -421,8 +421,8 @@ def _validate(config: Config) -> None:
         )
     if config.cost_estimate == "critic" and config.gamma == 1:
         raise UsageError(
-            "cost_estimate = critic takes the cost of a step for (1 - gamma) times the value; set gamma below 1 or take "
-            "another cost_estimate"
+            "cost_estimate = critic takes (1 - gamma) times the value for the cost of a step, which is 0; set gamma "
+            "below 1 or take another cost_estimate"
         )
     _validate_sizes(config)
 
