@@ -7,7 +7,8 @@ import json
 import os
 import pathlib
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from .errors import UsageError
@@ -64,14 +65,29 @@ def replace_text(path: pathlib.Path, text: str) -> None:
     partial.replace(path)
 
 
-def read_rows(metrics: pathlib.Path, missing_ok: bool = True) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl; a line that is not one, such as the end of a write that was cut off, is left out.
+def to_stderr(line: str) -> None:
+    """Prints a line that is no result."""
+    print(line, file=sys.stderr)
+
+
+def read_rows(
+    metrics: pathlib.Path, missing_ok: bool = True, note: Callable[[str], object] = to_stderr
+) -> list[dict[str, Any]]:
+    """The rows of a metrics.jsonl. Lines that are none are left out with a note; of the last, a cut-off write, without.
 
     Raises:
       OSError: it cannot be read; if there is no file and `missing_ok`, there are no rows.
     """
-    rows = []
-    for line in [] if missing_ok and not metrics.exists() else metrics.read_text(errors="replace").splitlines():
+    lines = [] if missing_ok and not metrics.exists() else metrics.read_text(errors="replace").splitlines()
+    rows, broken = [], []
+    for number, line in enumerate(lines, start=1):
+        row = None
         with contextlib.suppress(ValueError, RecursionError):
-            rows.append(json.loads(line))
-    return [row for row in rows if isinstance(row, dict)]
+            row = json.loads(line)
+        if isinstance(row, dict):
+            rows.append(row)
+        elif number < len(lines) and line.strip():
+            broken.append(number)
+    if broken:
+        note(f"left out: {len(broken)} damaged line(s) of {metrics}, the first of them line {broken[0]}")
+    return rows

@@ -47,7 +47,8 @@ def _describe(name: str) -> int:
     for what, text in facts.items():
         say(f"  {what:12} {text}")
     options = tasks.options(name) | (dict(load_config(name).env) if name in toml.names() else {})
-    say("  options      --env NAME=VALUE, by default " + ", ".join(f"{k}={v}" for k, v in options.items()))
+    defaults = ", by default " + ", ".join(f"{k}={v}" for k, v in options.items()) if options else ": it has none"
+    say(f"  options      --env NAME=VALUE{defaults}")
     for line in tasks.explain_options(name).splitlines():
         say(f"    {line}")
     return 0

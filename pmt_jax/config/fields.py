@@ -120,7 +120,7 @@ def expectation(kind: Any) -> str:
     if kind in (int, float, bool, str):
         return {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
     if typing.get_args(kind) == (int, ...):
-        return "whole numbers, as 128,128"
+        return "whole numbers, as 128,128 (in a file [128, 128])"
     if float in typing.get_args(kind):
         return "a number, or one for each cost: 1,0.5"
     return "name=value"

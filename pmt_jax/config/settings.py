@@ -355,6 +355,8 @@ def load_config(
         values["env"] = [pair for layer in layers for pair in convert("env", layer.get("env", ()))]
     if "task" in values:
         values["task"] = absolute(str(values["task"]))
+    if "task" not in values:
+        raise UsageError(f'{source} names no task; add extends = "TASK" with one that pmt envs lists')
     converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
     converted["method"] = method
     return Config(**converted)
@@ -442,4 +444,4 @@ def _validate_sizes(config: Config) -> None:
         raise UsageError(f"steps = {config.steps} is more than 2**31 updates of {config.batch_size} steps")
     for parts, what in ((config.minibatches, "equal minibatches"), (config.trust_steps, "trust steps")):
         if config.batch_size % parts:
-            raise UsageError(f"a batch of {config.batch_size} steps cannot be cut into {parts} {what}")
+            raise UsageError(f"a batch of {config.batch_size} steps cannot be cut into {parts} {what}; take a divisor")

@@ -76,6 +76,8 @@ def load_run(
         raise UsageError(f"unknown checkpoint '{which}'{did_you_mean(which, WHICH)}")
     if hub.is_name(folder):
         return hub.load(str(folder), physics)
+    if not pathlib.Path(folder).exists() and f"{hub.PREFIX}{folder}" in hub.names():
+        raise UsageError(f"{folder} is a pretrained policy, not a run folder; name it {hub.PREFIX}{folder}")
     check_trusted(folder)
     setup, _, saved = load_saved(folder, physics, warn)
     return setup, saved["last"] if which == "last" else saved["best"].state

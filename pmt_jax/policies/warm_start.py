@@ -107,6 +107,7 @@ def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
     if shapes[0] != shapes[1]:
         raise UsageError(
             f"{name} of {source} has other shapes than this run's; start from a run of a task with the same "
-            "observations and agents, with the same hidden and layer_norm"
+            "observations and agents, with the same hidden and layer_norm, and of a method that also "
+            "has one policy for all agents (mappo) or one for each (all others)"
         )
     return jax.tree.map(lambda x, new: x[jnp.arange(new.shape[0]) % x.shape[0]], theirs, like)

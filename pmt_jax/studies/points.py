@@ -133,6 +133,8 @@ def _check(part: Part, fixed: Mapping[str, Any]) -> None:
             raise UsageError(f"{name} varies and is given by itself; leave one of the two out")
         if name not in FIELDS:
             raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
+        if name in part.values and not part.values[name]:
+            raise UsageError(f"{name} varies over an empty list; give it at least one value")
         if name == "task":
             raise UsageError("--set has one task; sweep each with its own --out, or give each a [[sweep]] in a file")
     for name in part.ranges:

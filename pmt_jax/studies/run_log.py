@@ -9,7 +9,6 @@ import dataclasses
 import json
 import math
 import pathlib
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from ..config.settings import Config, load_config
 from ..errors import UsageError
-from ..files import read_rows
+from ..files import read_rows, to_stderr
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
@@ -164,7 +163,7 @@ def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[Run
     Raises:
       UsageError: a path does not exist, none of them holds a run with metrics, or a run cannot be read.
     """
-    note = note or _to_stderr
+    note = note or to_stderr
     logs, reasons = [], []
     for path in dict.fromkeys(paths):
         if str(path).startswith("hub:"):
@@ -178,9 +177,9 @@ def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[Run
         for folder in folders:
             if any(log.folder == folder for log in logs):
                 continue
-            log = read(folder)
+            log = read(folder, note)
             if log is None:
-                reasons.append(f"{folder} has no metrics yet: its metrics.jsonl is empty")
+                reasons.append(f"{folder} has no metrics yet: its metrics.jsonl has no row")
             else:
                 logs.append(log)
     if not logs:
@@ -188,10 +187,6 @@ def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[Run
     for reason in reasons:
         note(f"left out: {reason}")
     return logs
-
-
-def _to_stderr(line: str) -> None:
-    print(line, file=sys.stderr)
 
 
 def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
@@ -202,17 +197,17 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
             yield file.parent
 
 
-def read(folder: pathlib.Path) -> RunLog | None:
+def read(folder: pathlib.Path, note: Say = to_stderr) -> RunLog | None:
     """The run in `folder`; None if it has no metrics yet.
 
-    Lines cut off in the middle are left out; if a step occurs twice, the later line counts.
+    Damaged lines are left out with a note; if a step occurs twice, the later line counts.
 
     Raises:
       UsageError: settings or metrics that cannot be read, or are of the wrong type.
     """
     metrics = folder / "metrics.jsonl"
     try:
-        rows = read_rows(metrics, missing_ok=False)
+        rows = read_rows(metrics, missing_ok=False, note=note)
     except OSError as error:
         raise UsageError(f"{folder} has no metrics: cannot read its metrics.jsonl ({error.strerror})") from None
     return _log(folder, rows, metrics, _config(folder / "config.toml")) if rows else None

@@ -55,6 +55,8 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
 
     draws.json holds what was drawn at random.
     """
+    if (out / "config.toml").is_file():
+        raise UsageError(f"{out} holds a run, not a sweep; choose another --out")
     with claim(out):
         wanted = missing_programs(points, out, launch.say)
         if values := drawn(parts, points):

@@ -149,8 +149,8 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
         "limit: the cost allowed; seeds within: seeds whose cost is within it; worst seed: the highest cost of a seed."
         + " Of several costs, which are added, each must be within its own limit."
         * any(len(r.limits) > 1 for r in table),
-        "Interquartile mean over seeds [95 % studentised interval]; -: unknown, or not finite for some seed; [-]: one "
-        "seed has no interval.",
+        "Interquartile mean over seeds, below four the mean [95 % studentised interval]; -: unknown, or not finite for "
+        "some seed; [-]: one seed has no interval.",
     ]
     if baseline:
         notes.append(f"P: probability that a seed of the row does better than a seed of {baseline}; ties count half.")

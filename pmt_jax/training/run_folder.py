@@ -93,6 +93,20 @@ def _same_settings(old: Config, new: Config, out: pathlib.Path, change: bool) ->
         )
 
 
+def check_steps_left(out: pathlib.Path, step: int, config: Config) -> None:
+    """Whether a run that continues after `step` has an update left to make with what changed.
+
+    Raises:
+      UsageError: its settings changed, and it has none.
+    """
+    changed = differences(load_config(out / "config.toml"), config).keys() - {"steps"}
+    if changed and step >= config.num_updates * config.batch_size:
+        raise UsageError(
+            f"the run in {out} has {step:,} steps already, so nothing is left to train with other settings; "
+            f"ask for --steps of {step + config.batch_size} or more"
+        )
+
+
 def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> None:
     """Appends what `config` changes of the run's settings after `step` to changes.jsonl, if anything."""
     changed = {x: y for x, y in differences(load_config(out / "config.toml"), config).items() if x != "steps"}
@@ -147,7 +161,7 @@ def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
       UsageError: a row is not one of a run.
     """
     metrics = out / "metrics.jsonl"
-    rows = read_rows(metrics)
+    rows = read_rows(metrics, note=say)
     for row in rows:
         _check_number(metrics, row, "step")
     if step == 0 and rows:
@@ -187,6 +201,16 @@ def initial_best(state: LearnerState) -> Best:
     return Best(_copy(state), -nothing, nothing)
 
 
+def _what_it_is(folder: pathlib.Path) -> str:
+    """Of a path that holds no run: why, and what to name instead."""
+    if folder.is_file():
+        return f"it is a file; name its folder, {folder.parent}" if folder.name == "config.toml" else "it is a file"
+    if not folder.exists():
+        return "there is no such folder"
+    runs = sorted(str(file.parent) for file in folder.glob("*/config.toml"))
+    return f"it holds {len(runs)} run(s); name one, as {runs[0]}" if runs else "it has no config.toml"
+
+
 @jax.jit
 def _copy(state: LearnerState) -> LearnerState:
     return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
@@ -201,7 +225,7 @@ def load_saved(
       UsageError: the folder holds no run, or no checkpoint.
     """
     if not (folder / "config.toml").is_file():
-        raise UsageError(f"{folder} is not a run folder: it has no config.toml")
+        raise UsageError(f"{folder} is not a run folder: {_what_it_is(folder)}")
     if not (folder / "checkpoints").is_dir():
         raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
     config = load_config(folder / "config.toml")

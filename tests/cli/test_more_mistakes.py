@@ -29,6 +29,8 @@ FILES = {
     "twice.toml": b'task = "lane"\nclip = 0.1\nclip = 0.2',
     "method.toml": b'task = "lane"\nmethod = "ppo"',
     "pairs.toml": b'task = "lane"\nenv = [1]',
+    "empty_list.toml": b'extends = "lane"\n[[sweep]]\nset.clip = []',
+    "no_task.toml": b"clip = 0.1",
     "empty.py": b"",
     "syntax.py": b"def (",
     "exits.py": b"raise SystemExit(0)",
@@ -71,7 +73,7 @@ train lane --seed 1e30 | seed must lie between 0 and 2**31 - seeds
 train lane --steps 1,000 | steps = '1,000' does not fit
 train lane --steps 1k | steps = '1k' does not fit
 train lane --steps 1e6.5 | steps = '1e6.5' does not fit
-train lane --num-envs 7 --minibatches 3 | a batch of 175 steps cannot be cut into 3 equal minibatches
+train lane --num-envs 7 --minibatches 3 | a batch of 175 steps cannot be cut into 3 equal minibatches; take a divisor
 train lane --rollout-length 0 | rollout_length must be at least 1
 train lane --epochs 0 | epochs must be at least 1
 train lane --hidden 64,-1 | hidden must name at least one layer of at least one unit, not [64, -1]
@@ -131,6 +133,10 @@ sweep lane --set method=happo,mappo --method macpo --out s | method varies and i
 sweep lane --set env=num_agents=2,num_agents=3 --env num_agents=4 --out s | the option num_agents varies and is given by
 sweep lane --set seed=0,1 --seeds 2 --out s | 'seed=0' and 'seed=1' would both train seed 1: with seeds = 2 their first
 sweep lane --set cost_limit=1,[1,2] --out s | cost_limit has 2 numbers, but task 'lane' has 1 cost(s); give one number
+sweep empty_list.toml --out s | clip varies over an empty list; give it at least one value
+sweep lane --set clip=0.1,0.2 --out run | run holds a run, not a sweep; choose another --out
+train no_task.toml | no_task.toml names no task; add extends = "TASK"
+train run | run is a run folder; its settings are run/config.toml
 sweep lane --set env=num_agents=2,agents=3 --out s | task 'lane' has no option 'agents'
 sweep lane --set clip=0.1,0.2 --out file | cannot write into file: File exists; choose another --out
 sweep lane --set clip=a:b --random 2 --out s | random draws need a range
@@ -140,7 +146,10 @@ sweep lane --set clip=0.1,0.2 --seeds 0 --out s | seeds must be at least 1
 sweep hub:ant_2x4/r4sg --set clip=0.1,0.2 --out s | unknown task 'hub:ant_2x4/r4sg'
 eval | the following arguments are required: RUN|TASK
 eval run run | unexpected word 'run' (see pmt eval --help)
-eval file | file is not a run folder: it has no config.toml
+eval file | file is not a run folder: it is a file
+eval run/config.toml | run/config.toml is not a run folder: it is a file; name its folder, run
+eval . | . is not a run folder: it holds
+eval ant_2x4/f4sg | is a pretrained policy, not a run folder; name it hub:ant_2x4/f4sg
 eval run | there is no finished checkpoint in run/checkpoints; train the run first
 eval run --episodes 1e3 | --episodes must be a whole number of at least 1, not '1e3'
 eval run --episodes 99999999999 | --episodes must be a whole number of at most 2147483647

@@ -31,6 +31,15 @@ def test_metrics_are_read_as_they_stand(tmp_path: pathlib.Path):
     np.testing.assert_allclose(thin.metrics["episode_reward"][0, :2], [5.5, 15.5])
 
 
+def test_only_a_last_line_may_be_damaged_without_a_note(tmp_path: pathlib.Path, cli):
+    """It is what a killed run leaves. Others change the scores."""
+    good = [row(step, 0, 1.0) for step in range(1, 11)]
+    for name, lines, damaged in (("cut", [*good, '{"st'], 0), ("bad", [good[0], "x\n", "[]\n", *good[1:]], 2)):
+        code, _, err = cli("table", written(tmp_path / name, lines))
+        assert code == 0 and ("2 damaged line(s)" in err and "line 2" in err if damaged else not err)
+    assert "has no row" in cli("table", written(tmp_path / "none", ["x\n", "y\n"]))[2]
+
+
 def test_a_run_can_be_read_as_if_it_had_ended_earlier(tmp_path: pathlib.Path):
     log = run_log.read(written(tmp_path / "a", [row(step, 0, float(step)) for step in range(1, 1001)]))
     early = log.until(500)
@@ -120,7 +129,7 @@ def test_what_is_no_run_gets_one_sentence(command: str, tmp_path: pathlib.Path, 
     assert ". holds no run: no folder in it has a config.toml and a metrics.jsonl" in cli(command, ".")[2]
     assert "hub:lane/f4sg is a pretrained policy, which has no metrics" in cli(command, "hub:lane/f4sg")[2]
     written(tmp_path / "begun", [])
-    assert "begun has no metrics yet: its metrics.jsonl is empty" in cli(command, "begun")[2]
+    assert "begun has no metrics yet: its metrics.jsonl has no row" in cli(command, "begun")[2]
     (written(tmp_path / "latin", [row(10, 0, 1.0)]) / "config.toml").write_bytes(b'task = "\xe9"')
     code, _, err = cli(command, "latin")
     assert code == 2 and "is not valid TOML" in err and err.count("\n") == 1

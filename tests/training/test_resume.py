@@ -225,6 +225,16 @@ def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Pat
     assert run_log.read(copy).identity != run_log.read(whole).identity
 
 
+def test_a_run_that_has_ended_says_what_would_train(copy: pathlib.Path, cli):
+    """It would drop the other settings otherwise."""
+    command = ("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
+    before = (copy / "config.toml").read_text()
+    code, _, err = cli(*command, "--change", "--clip", 0.1)
+    assert code == 2 and f"has {STEPS:,} steps already" in err and f"--steps of {STEPS + 100} or more" in err
+    assert (copy / "config.toml").read_text() == before and not (copy / "changes.jsonl").exists()
+    assert cli(*command, "--change")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
