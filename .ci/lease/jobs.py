@@ -48,4 +48,4 @@ WALLS = {
 # makes 470,000 steps/s if it is alone.
 PROGRAMS = 2
 WEIGHTS = dict.fromkeys(CELLS, 2) | dict.fromkeys(WALLS, 0.4)
-JOBS = CELLS | OTHER_ANT | MACPO | WALLS
+JOBS = OTHER_ANT | MACPO | WALLS
