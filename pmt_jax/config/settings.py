@@ -353,10 +353,9 @@ def load_config(
     values = {name: value for layer in layers for name, value in layer.items()}
     if "env" in values:
         values["env"] = [pair for layer in layers for pair in convert("env", layer.get("env", ()))]
-    if "task" in values:
-        values["task"] = absolute(str(values["task"]))
     if "task" not in values:
         raise UsageError(f'{source} names no task; add extends = "TASK" with one that pmt envs lists')
+    values["task"] = absolute(str(values["task"]))
     converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
     converted["method"] = method
     return Config(**converted)
