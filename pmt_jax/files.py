@@ -13,6 +13,8 @@ from typing import Any
 
 from .errors import UsageError
 
+Note = Callable[[str], object]  # called with a sentence about what is left out
+
 
 @contextlib.contextmanager
 def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
@@ -70,9 +72,7 @@ def to_stderr(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def read_rows(
-    metrics: pathlib.Path, missing_ok: bool = True, note: Callable[[str], object] = to_stderr
-) -> list[dict[str, Any]]:
+def read_rows(metrics: pathlib.Path, missing_ok: bool = True, note: Note = to_stderr) -> list[dict[str, Any]]:
     """The rows of a metrics.jsonl. Lines that are none are left out with a note; of the last, a cut-off write, without.
 
     Raises:

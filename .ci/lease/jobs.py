@@ -30,6 +30,6 @@ MACPO = {
 }
 # What a GPU holds at a time, and how much of it a run counts as; the others count as 1. A program of 60 x 384 ants
 # makes 470,000 steps/s if it is alone.
-PROGRAMS = 2
+PROGRAMS = 1
+WEIGHTS: dict[str, float] = {}
 JOBS = CELLS | MACPO | REGRET  # | IF_EIGHT
-WEIGHTS = dict.fromkeys(JOBS | IF_EIGHT, 2)

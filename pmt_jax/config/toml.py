@@ -66,8 +66,8 @@ def _find(source: str) -> pathlib.Path:
         return CONFIG_DIR / f"{source}.toml"
     if source.endswith(".toml") or os.path.isfile(source):
         return pathlib.Path(source)
-    if os.path.isfile(os.path.join(source, "config.toml")):
-        raise UsageError(f"{source} is a run folder; its settings are {os.path.join(source, 'config.toml')}")
+    if os.path.isfile(settings := os.path.join(source, "config.toml")):
+        raise UsageError(f"{source} is a run folder; its settings are {settings}")
     raise UsageError(f"unknown task '{source}'{did_you_mean(source, known)} (pmt envs lists all)")
 
 

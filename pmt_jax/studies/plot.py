@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UsageError
-from ..files import writing
+from ..files import Note, writing
 from ..tasks import columns
 from .rows import in_order, same
-from .run_log import Group, RunLog, Say, groups, read_all
+from .run_log import Group, RunLog, groups, read_all
 
 POINTS = 100  # of a curve
 TRAINING = {
@@ -64,7 +64,7 @@ class Look(NamedTuple):
     dashes: str = ""
 
 
-def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Say | None = None) -> None:
+def plot(folders: Sequence[pathlib.Path], out: pathlib.Path, note: Note | None = None) -> None:
     """Draws the curves of run folders into `out` (.png, .svg or .pdf): a row of panels a task, a colour a method.
 
     Args:
@@ -83,7 +83,7 @@ def check_ending(out: pathlib.Path) -> None:
         raise UsageError(f"cannot write {out}: its ending must be .png, .svg or .pdf")
 
 
-def pooled(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
+def pooled(logs: Sequence[RunLog], note: Note | None = None) -> list[Group]:
     """Runs that are the same up to seeds, as METHODS is, their curves averaged into at most POINTS points."""
     return in_order(groups([log.thinned(POINTS) for log in logs], note or print))
 

@@ -11,7 +11,7 @@ import pathlib
 from typing import Any
 
 from ..config.settings import load_config
-from ..files import read_rows
+from ..files import Note, read_rows, to_stderr
 from .points import Points
 
 
@@ -31,9 +31,9 @@ def settings_file(point: pathlib.Path) -> pathlib.Path:
     return next((file for file in (point / "config.toml", *begun) if file.is_file()), point / "config.toml")
 
 
-def rows(folder: pathlib.Path, group: Points) -> dict[str, list[dict[str, Any]]]:
+def rows(folder: pathlib.Path, group: Points, note: Note = to_stderr) -> dict[str, list[dict[str, Any]]]:
     """{point: rows}, the metrics so far of each point of a program, as a run of its own would have written them."""
-    every = read_rows(folder / "run" / "metrics.jsonl")
+    every = read_rows(folder / "run" / "metrics.jsonl", note=note)
     found, first = {}, 0
     for name, config in group.items():
         trials, limit = range(first, first + config.seeds), config.cost_limit

@@ -16,10 +16,11 @@ import numpy as np
 
 from ..config.methods import METHODS
 from ..errors import UsageError
+from ..files import Note
 from ..formats import limits
 from ..tasks import columns as task_columns
 from . import statistics
-from .run_log import Group, RunLog, Say, groups
+from .run_log import Group, RunLog, groups
 
 
 class Column(NamedTuple):
@@ -135,7 +136,7 @@ class Row:
 RowOrGroup = TypeVar("RowOrGroup", Row, Group)
 
 
-def rows(logs: Sequence[RunLog], note: Say | None = None) -> list[Row]:
+def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[Row]:
     """One row per task, method and settings, in the order of the tasks' names and of METHODS.
 
     Args:

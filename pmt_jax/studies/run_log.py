@@ -9,22 +9,20 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..config.settings import Config, load_config
 from ..errors import UsageError
-from ..files import read_rows, to_stderr
+from ..files import Note, read_rows, to_stderr
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
 IDENTITY = {"step": int, "seed": int, "task": str, "method": str, "cost_limit": float}  # what every row says
 TEXT = ("broken",)  # besides
-
-Say = Callable[[str], object]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +155,7 @@ def _averaged(values: np.ndarray, starts: list[int]) -> np.ndarray:
 # Reading
 
 
-def read_all(paths: Sequence[pathlib.Path], note: Say | None = None) -> list[RunLog]:
+def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[RunLog]:
     """The runs among and below `paths`, also the points of a sweep under way; other folders are left out with a note.
 
     Raises:
@@ -197,7 +195,7 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
             yield file.parent
 
 
-def read(folder: pathlib.Path, note: Say = to_stderr) -> RunLog | None:
+def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
     """The run in `folder`; None if it has no metrics yet.
 
     Damaged lines are left out with a note; if a step occurs twice, the later line counts.
@@ -213,13 +211,13 @@ def read(folder: pathlib.Path, note: Say = to_stderr) -> RunLog | None:
     return _log(folder, rows, metrics, _config(folder / "config.toml")) if rows else None
 
 
-def _under_way(path: pathlib.Path, note: Say) -> list[RunLog]:
+def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
     """The points of sweeps at and below `path` that have not ended, as far as they are; each names its later folder."""
     found = []
     for group in sorted(path.rglob(".group-*")):
         metrics = group / "run" / "metrics.jsonl"
         configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
-        rows = program_folder.rows(group, configs)
+        rows = program_folder.rows(group, configs, note)
         missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
         logs = [_log(group.parent / name, rows[name], metrics, configs[name]) for name in missing]
         if logs:
@@ -366,7 +364,7 @@ class Group:
         return np.concatenate(known) if len(known) == len(found) else None
 
 
-def groups(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
+def groups(logs: Sequence[RunLog], note: Note | None = None) -> list[Group]:
     """Pools runs that are the same up to seeds, in the order given.
 
     Args:
@@ -383,7 +381,7 @@ def groups(logs: Sequence[RunLog], note: Say | None = None) -> list[Group]:
     return [Group(tuple(runs), _differing(runs[0], [others[0] for others in pooled])) for runs in pooled]
 
 
-def _without_repeats(runs: Sequence[RunLog], note: Say | None) -> list[RunLog]:
+def _without_repeats(runs: Sequence[RunLog], note: Note | None) -> list[RunLog]:
     kept: list[RunLog] = []
     for run in runs if note is None else sorted(runs, key=lambda run: -run.steps[-1]):
         twice = [(seed, other) for other in kept for seed in run.seeds if seed in other.seeds]

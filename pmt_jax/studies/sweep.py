@@ -55,8 +55,6 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
 
     draws.json holds what was drawn at random.
     """
-    if (out / "config.toml").is_file():
-        raise UsageError(f"{out} holds a run, not a sweep; choose another --out")
     with claim(out):
         wanted = missing_programs(points, out, launch.say)
         if values := drawn(parts, points):
@@ -126,7 +124,13 @@ class Program:
 
 
 def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Program]:
-    """What is missing of `points`."""
+    """What is missing of `points`.
+
+    Raises:
+      UsageError: `out` is a run's folder, or holds a point of the same name with other settings.
+    """
+    if (out / "config.toml").is_file():
+        raise UsageError(f"{out} holds a run, not a sweep; choose another --out")
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")

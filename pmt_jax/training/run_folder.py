@@ -93,14 +93,18 @@ def _same_settings(old: Config, new: Config, out: pathlib.Path, change: bool) ->
         )
 
 
-def check_steps_left(out: pathlib.Path, step: int, config: Config) -> None:
-    """Whether a run that continues after `step` has an update left to make with what changed.
+def _changed(out: pathlib.Path, config: Config) -> dict[str, str]:
+    """What `config` changes of the run's settings, all but the steps: {name: 'old -> new'}."""
+    return {x: y for x, y in differences(load_config(out / "config.toml"), config).items() if x != "steps"}
+
+
+def check_unchanged(out: pathlib.Path, step: int, config: Config) -> None:
+    """Whether a run that has ended after `step` is asked for as it is.
 
     Raises:
-      UsageError: its settings changed, and it has none.
+      UsageError: its settings changed, and no update is left to make with them.
     """
-    changed = differences(load_config(out / "config.toml"), config).keys() - {"steps"}
-    if changed and step >= config.num_updates * config.batch_size:
+    if _changed(out, config):
         raise UsageError(
             f"the run in {out} has {step:,} steps already, so nothing is left to train with other settings; "
             f"ask for --steps of {step + config.batch_size} or more"
@@ -109,8 +113,7 @@ def check_steps_left(out: pathlib.Path, step: int, config: Config) -> None:
 
 def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> None:
     """Appends what `config` changes of the run's settings after `step` to changes.jsonl, if anything."""
-    changed = {x: y for x, y in differences(load_config(out / "config.toml"), config).items() if x != "steps"}
-    if changed:
+    if changed := _changed(out, config):
         with (out / "changes.jsonl").open("a") as file:
             file.write(json.dumps({"step": step, "changed": changed}) + "\n")
         say(f"from step {step:,} on: {', '.join(f'{name} {change}' for name, change in changed.items())}")

@@ -200,10 +200,11 @@ class Trainer:
         self.checkpoints = stack.enter_context(contextlib.closing(Checkpoints(self.out)))
         if resume:
             self._restore()
-            run_folder.check_steps_left(self.out, self.step, self.config)
             if self.step < self.total:
                 processes.by_first(lambda: run_folder.record_changes(self.out, self.step, self.config, self.say))
                 processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
+            else:
+                run_folder.check_unchanged(self.out, self.step, self.config)
         processes.by_first(lambda: self._open_loggers(stack, loggers))
         self._profile = stack.enter_context(contextlib.closing(Profile(profile)))
 

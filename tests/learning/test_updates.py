@@ -278,8 +278,7 @@ def test_share_of_episodes_within_and_cost_beyond_the_limit():
 @pytest.mark.parametrize("limit", [1, 10, 25])
 def test_a_cost_that_is_its_limit_is_within_it(seen: float, limit: int):
     """Both are rounded to 32 bits."""
-    setup = make_setup(load_config("lane", cost_seen=seen))
-    hyper = dataclasses.replace(setup.hyper, cost_limit=jnp.asarray(seen * limit, jnp.float32))
+    hyper = hyper_of(acted()[0], seen * limit, cost_seen=seen)
     true = jnp.asarray([[limit - 1.0], [limit], [limit + 1.0]])
     beyond = jax.jit(lambda hyper: rollout.cost_beyond(true, true, hyper, 1000))(hyper)
     assert (beyond[:, 0] > 0).tolist() == [False, False, True]

@@ -37,8 +37,15 @@ def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
 def test_a_table_says_how_the_limit_was_kept(tmp_path: pathlib.Path, cli):
     """Shares of episodes at the end; the excess over all of training."""
     lines = [
-        row(100 * step, seed, 1.0, episode_cost=0.5 + seed, within_limit=step / 20, episode_cost_beyond=seed * beyond)
-        for step, beyond in enumerate(range(19, -1, -1), start=1)
+        row(
+            100 * step,
+            seed,
+            1.0,
+            episode_cost=0.5 + seed,
+            within_limit=step / 20,
+            episode_cost_beyond=seed * (20.0 - step),
+        )
+        for step in range(1, 21)
         for seed in (0, 1)
     ]
     written(tmp_path / "a", lines)
