@@ -18,7 +18,7 @@ def cell(form: str, method: str, limits: str, seeds: int) -> dict[str, str]:
 
 CELLS = cell("c", "mappo_l", "0.2,1,10", 20) | cell("c", "f4sg", "0.2,1,10", 20)
 REGRET = cell("c", "r4sg", "0.2,1,10,25", 10)
-IF_EIGHT = cell("a", "mappo_l", "0.2,1,10", 20) | cell("a", "f4sg", "0.2,1,10", 20)
+WHOLE = cell("a", "mappo_l", "0.2,1,10", 20) | cell("a", "f4sg", "0.2,1,10", 20)
 # MACPO: at all limits on ant 4x2, ten seeds, from the start; at 0.2 on ant 2x4 it continues (.p5 and .p6).
 LOWERED = "--limit-lr=0.1 --cost-estimate=rate --cost-margin=0.9 --episode-starts=spread --rollout-length=8"
 LOWERED += " --log-interval=40 --kl-limit=0.01 --kl-half-life=3.4e6"
@@ -32,4 +32,4 @@ MACPO = {
 # makes 470,000 steps/s if it is alone.
 PROGRAMS = 1
 WEIGHTS: dict[str, float] = {}
-JOBS = CELLS | MACPO | REGRET  # | IF_EIGHT
+JOBS = CELLS | MACPO | REGRET | WHOLE
