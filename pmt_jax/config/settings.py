@@ -77,6 +77,12 @@ class Hyper:
     clip: float = learning(
         0.2, "half-width of the interval to which probability ratios and values are clipped", POSITIVE
     )
+    cost_value_clip: float = learning(
+        math.nan,
+        "half-width of the interval of cost values alone, in standard deviations of the returns; nan takes that of "
+        "clip. A clipped value moves by little more than this an update, too slowly for rare costs; inf clips none",
+        Bound("be a number above 0, inf, or nan for that of clip", lambda x: math.isnan(x) or x > 0),
+    )
     entropy_coef: float = learning(
         0.0, "weight of the policy's entropy, in nats summed over action dimensions", NOT_NEGATIVE
     )
@@ -277,8 +283,9 @@ class Config(Hyper):
     def __post_init__(self) -> None:
         if math.isnan(self.surrogate_weight):
             object.__setattr__(self, "surrogate_weight", float(self.rollout_length))
-        if math.isnan(self.fear_start):  # always the same nan, so that equal settings compare equal
-            object.__setattr__(self, "fear_start", math.nan)
+        for name in ("fear_start", "cost_value_clip"):
+            if math.isnan(getattr(self, name)):  # always the same nan, so that equal settings compare equal
+                object.__setattr__(self, name, math.nan)
         if self.trust_steps == 0:
             object.__setattr__(self, "trust_steps", self.minibatches)
         _validate(self)

@@ -121,9 +121,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     actor_rows = policy_rows(setup, hyper, weigh(state.multiplier), batch, advantage, cost_advantage, log_weight)
     rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
     fit_critic = partial(_fit_critic, setup, hyper)
+    cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     fitted = sharding.side_by_side(
-        partial(fit_critic, state.critic, setup.nets.value, rows, tagged[Tag.CRITIC]),
-        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_rows, tagged[Tag.COST_CRITIC]),
+        partial(fit_critic, state.critic, setup.nets.value, hyper.clip, rows, tagged[Tag.CRITIC]),
+        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_rows, tagged[Tag.COST_CRITIC]),
         partial(update_policies, setup, hyper, state.actor, state.multiplier, actor_rows, cost_excess, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, multiplier, actor_metrics) = fitted
@@ -230,12 +231,14 @@ def _fit_critic(
     hyper: Hyper,
     critic: Critic,
     value_fn: ValueFn,
+    clip: jax.Array | float,
     rows: tuple[jax.Array, jax.Array, jax.Array],
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:
     """Updates the moments of the returns once, then fits the critic to them in the new units.
 
     Args:
+      clip: half-width of the interval of values, in those units.
       rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
     """
     state, old_value, returns = rows
@@ -244,7 +247,7 @@ def _fit_critic(
 
     def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, old, target = minibatch
-        return value_loss(value_fn(params, state), old, target, hyper.clip).mean(), {}
+        return value_loss(value_fn(params, state), old, target, clip).mean(), {}
 
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": hyper.critic_lr, "max_grad_norm": hyper.max_grad_norm}

@@ -17,10 +17,10 @@ from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.config.settings import Hyper
 from pmt_jax.learning import learner, rollout
-from pmt_jax.learning.maths import lagrangian
+from pmt_jax.learning.maths import lagrangian, running_moments
 from pmt_jax.learning.policy_update import in_lambda_unit
 from pmt_jax.learning.setup import Setup
-from pmt_jax.learning.types import LearnerState
+from pmt_jax.learning.types import Critic, LearnerState
 from small import SMALL, acted, program, trained, weights
 
 
@@ -185,6 +185,40 @@ def test_an_update_moves_no_policy_further_than_kl_max(method: str):
         way = jax.tree.map(lambda x, y: x + share * (y - x), start.actor.params, free.actor.params)
         chex.assert_trees_all_close(held.actor.params, way, atol=1e-6)
     chex.assert_trees_all_equal(made.step(made.hyper(kl_max=2 * far.max()), start)[0], free)
+
+
+def test_unclipped_values_reach_rare_returns():
+    """One row of a hundred returns 50. With the clip its value moves by little more than `clip` an update."""
+    setup = make_setup(load_config("lane", critic_lr=3e-3))
+    state = jnp.tile(jnp.eye(2, setup.vector.spec.state_dim)[jnp.arange(100) // 99], (8, 1, 1))
+    returns = jnp.where(state[..., 1] > 0, 50.0, 0.0)
+
+    @jax.jit
+    def fitted(clip: jax.Array) -> jax.Array:
+        def values(critic: Critic) -> jax.Array:
+            return running_moments.denormalise(critic.returns, setup.nets.value(critic.net.params, state))
+
+        def update(critic: Critic, key: jax.Array) -> tuple[Critic, None]:
+            rows = state, values(critic), returns
+            return learner._fit_critic(setup, setup.hyper, critic, setup.nets.value, clip, rows, key)[0], None
+
+        start = learner.init(setup, setup.hyper, jax.random.key(0)).critic
+        critic, _ = jax.lax.scan(update, start, jax.random.split(jax.random.key(1), 20))
+        return values(critic)[0, -2:]
+
+    assert 0 < fitted(jnp.float32(0.05))[1] < 40
+    np.testing.assert_allclose(fitted(jnp.float32(math.inf)), [0, 50], atol=2.5)
+
+
+def test_the_clip_of_cost_values_is_that_of_the_cost_critic_alone():
+    made = program("mappo_l")
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    plain, same, free = (made.step(made.hyper(cost_value_clip=x), start)[0] for x in (math.nan, 0.2, math.inf))
+    assert made.setup.hyper.clip == np.float32(0.2)
+    chex.assert_trees_all_equal(plain, same)
+    chex.assert_trees_all_equal(plain.critic, free.critic)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(plain.cost_critic.net.params, free.cost_critic.net.params)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
