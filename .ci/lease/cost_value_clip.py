@@ -62,20 +62,13 @@ def main(run: pathlib.Path, updates: int = 90) -> None:
             critic, value = fit(critic, batch, jnp.float32(clip), jax.random.key(k))
             critics[name] = clip, critic
             values[name].append(np.asarray(value))
-    future = _discounted(np.concatenate(costs, 1), np.concatenate(done, 1), float(hyper.gamma))
+    # Advantages over values of 0 with a trace that does not decay are the discounted costs up to an episode's end.
+    follows = jax.vmap(lambda cost, done: gae(cost, 0.0, 0.0, done, done, hyper.gamma, 1.0)[0])
+    future = np.asarray(follows(np.concatenate(costs, 1), np.concatenate(done, 1)))
     judged = slice(future.shape[1] // 2, future.shape[1] - FUTURE)
     for name in critics:
         for seed, (value, truth) in enumerate(zip(np.concatenate(values[name], 1), future, strict=True)):
             _report(f"seed {seed}, cost_value_clip {name}:", value[judged].ravel(), truth[judged].ravel())
-
-
-def _discounted(cost: np.ndarray, done: np.ndarray, gamma: float) -> np.ndarray:
-    """The discounted costs that follow each step [S, T, B]; nothing follows the end of an episode."""
-    later, future = np.zeros_like(cost[:, 0]), np.zeros_like(cost)
-    for t in reversed(range(cost.shape[1])):
-        later = cost[:, t] + gamma * np.where(done[:, t], 0, later)
-        future[:, t] = later
-    return future
 
 
 def _report(name: str, value: np.ndarray, truth: np.ndarray) -> None:

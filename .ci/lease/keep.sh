@@ -4,11 +4,11 @@ if [ "$1" = 1 ]; then
   rm -f part*
   runs=$(grep -hao '[^ ]* --resume' /tmp/runs/logs/* | cut -d ' ' -f 1 | sort -u)
   [ -n "$runs" ] || [ -e /tmp/runs/ended ] || runs=$(ls -d /tmp/runs/runs/*/*)
-  groups=$(ls -d /tmp/runs/runs/*/*/.group-*) # of sweeps that have not ended
-  for run in $runs $(echo $groups | xargs -rn 1 printf '%s/run\n'); do
+  sweep="/tmp/runs/runs/*/*/.group-*" # one that has not ended
+  for run in $runs $(ls -d $sweep/run); do
     newest=$(ls "$run/checkpoints" | grep -x '[0-9]*' | sort -n | tail -1)
     [ -z "$newest" ] || printf '%s\n' "$run"/{config.toml,versions.json,metrics.jsonl} "$run/checkpoints/$newest"
-  done | cat - <(echo $groups | xargs -rn 1 printf '%s/points\n') | tar cf - -T - | xz -T0 -1 | split -b 15900000 - part
+  done | cat - <(ls -d $sweep/points) | tar cf - -T - | xz -T0 -1 | split -b 15900000 - part
 fi
 ls -l
 ls | tail -n "+$((4 * $1 - 3))" | head -4 | xargs -I{} cp {} "$OUT/"
