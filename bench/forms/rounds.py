@@ -267,6 +267,17 @@ def as_beside_f4sg(file: pathlib.Path) -> str:
     return beside([_first(runs.load(file), method="f4sg")])
 
 
+def as_unclipped(file: pathlib.Path) -> str:
+    """Limits: cells without a clip on cost values beside those of the same method, rule and limit with it."""
+    clipped = ("limits_pid_h200", "limits_control_h200", "limits_macpo_02_h200")
+    others = [run for name in clipped for run in runs.load(file.with_name(f"{name}.json"))]
+
+    def cell(run: runs.Run) -> tuple[Any, ...]:
+        return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
+
+    return beside([[next(x for x in others if cell(x) == cell(run)), run] for run in runs.load(file)])
+
+
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
@@ -339,4 +350,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "prior_in_time": as_prior_in_time,
     "beside_mappo_l": as_beside_mappo_l,
     "beside_f4sg": as_beside_f4sg,
+    "unclipped": as_unclipped,
 }

@@ -29,6 +29,7 @@ SHOWN |= {"regret_response": "`{}`", "lambda_kp": "`lambda_kp` {}", "lr_half_lif
 SHOWN |= {name: f"`{name}` {{}}" for name in ("fear_lr_start", "kappa", "surrogate_weight", "regret_max")}
 SHOWN |= {name: f"`{name}` {{}}" for name in ("num_envs", "init_fear")}
 SHOWN |= {"sway": "the corridor moves, {}"}
+SHOWN |= {"cost_limit": "limit {}", "cost_value_clip": "`cost_value_clip` {}"}
 OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 LAST = 0.1  # share of the steps that count as the end
 

@@ -71,7 +71,11 @@ class Hyper:
         "square of its length, so half of lr_half_life shrinks both alike",
         Bound("be a number of steps above 0, or inf", lambda x: x > 0),
     )
-    max_grad_norm: float = learning(10.0, "gradients are scaled down to this global norm", POSITIVE)
+    max_grad_norm: float = learning(
+        10.0,
+        "gradients are scaled down to this global norm; inf leaves them. Those of a policy grow with its multiplier",
+        Bound("be a number above 0, or inf", lambda x: x > 0),
+    )
     gamma: float = learning(0.99, "discount per control step, for reward and cost alike", SHARE)
     gae_lambda: float = learning(0.95, "lambda of generalised advantage estimation, for reward and cost alike", SHARE)
     clip: float = learning(
@@ -84,7 +88,10 @@ class Hyper:
         Bound("be a number above 0, inf, or nan for that of clip", lambda x: math.isnan(x) or x > 0),
     )
     entropy_coef: float = learning(
-        0.0, "weight of the policy's entropy, in nats summed over action dimensions", NOT_NEGATIVE
+        0.0,
+        "weight of the policy's entropy, in nats summed over action dimensions; below 0 the noise of actions falls "
+        "faster",
+        Bound("be a number that fits 32 bits", lambda x: -FLOAT32_MAX <= x <= FLOAT32_MAX),
     )
     value_norm_decay: float = learning(0.995, "share of the running moments of returns that survives an update", SHARE)
     cost_limit: float | tuple[float, ...] = constraint(

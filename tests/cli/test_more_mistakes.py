@@ -84,7 +84,7 @@ train lane --activation RELU | activation = 'RELU' does not fit: expected relu |
 train lane --layer-norm 2 | layer_norm = '2' does not fit: expected true or false
 train lane --actor-lr -1e-3 | actor_lr must be a number that is not negative and fits 32 bits, not -0.001
 train lane --actor-lr -inf | actor_lr must be a number that is not negative and fits 32 bits, not -inf
-train lane --max-grad-norm 0 | max_grad_norm must be a number above 0, not 0.0
+train lane --max-grad-norm 0 | max_grad_norm must be a number above 0, or inf, not 0.0
 train lane --gae-lambda 2 | gae_lambda must lie in [0, 1], not 2.0
 train lane --clip 0 | clip must be a number above 0, not 0.0
 train lane --value-norm-decay 1.1 | value_norm_decay must lie in [0, 1], not 1.1

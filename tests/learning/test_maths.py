@@ -265,16 +265,18 @@ def test_fit_finds_the_least_squares_solution_and_sees_every_row_in_each_epoch()
     np.testing.assert_allclose(metrics["mean_target"], (x @ weights).mean(), rtol=1e-5)
 
 
-def test_fit_scales_gradients_down_to_the_given_norm():
+@pytest.mark.parametrize(("bound", "step"), [(1e-8, 0.5e-8 / 1e-5), (np.inf, 1.0)])
+def test_fit_scales_gradients_down_to_the_given_norm(bound: float, step: float):
+    """Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps in place of 1."""
+
     def loss(params: jax.Array, rows: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         return 1e6 * params.sum() + 0 * rows.sum(), {}
 
     one_step = {"learning_rate": 1.0, "epochs": 1, "minibatches": 1}
     net, metrics = fit(
-        init_train_state(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=1e-8, **one_step
+        init_train_state(jnp.zeros(4)), loss, jnp.ones((2, 1)), jax.random.key(0), max_grad_norm=bound, **one_step
     )
-    # Adam's eps of 1e-5 dwarfs a gradient of norm 1e-8, so the step is gradient / eps instead of +-1.
-    np.testing.assert_allclose(net.params, -0.5e-8 / 1e-5, rtol=1e-2)
+    np.testing.assert_allclose(net.params, -step, rtol=1e-2)
     np.testing.assert_allclose(metrics["grad_norm"], 2e6, rtol=1e-5)
 
 

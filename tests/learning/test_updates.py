@@ -187,6 +187,14 @@ def test_an_update_moves_no_policy_further_than_kl_max(method: str):
     chex.assert_trees_all_equal(made.step(made.hyper(kl_max=2 * far.max()), start)[0], free)
 
 
+def test_the_weight_of_entropy_has_a_sign():
+    """Above 0 an update leaves more noise of actions than at 0, below 0 less."""
+    made = program("mappo_l")
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    ends = [made.step(made.hyper(entropy_coef=x), start)[1]["actor/std"] for x in (-1.0, 0.0, 1.0)]
+    assert ends[0] < ends[1] < ends[2]
+
+
 def test_unclipped_values_reach_rare_returns():
     """One row of a hundred returns 50. With the clip its value moves by little more than `clip` an update."""
     setup = make_setup(load_config("lane", critic_lr=3e-3))
