@@ -28,9 +28,9 @@ def main(run: pathlib.Path, scales: list[float]) -> None:
     use_cache()
     setup, _, acting = load_seed(run)
 
-    @functools.partial(jax.jit, static_argnums=2)
+    @jax.jit
     def act(
-        state: rollout.RolloutState, key: jax.Array, scale: float
+        state: rollout.RolloutState, key: jax.Array, scale: jax.Array | float
     ) -> tuple[rollout.RolloutState, dict[str, jax.Array]]:
         def policy(obs: jax.Array) -> tuple[jax.Array, jax.Array]:
             mean, std = setup.nets.policies(acting.actor.params, obs)
