@@ -1,4 +1,7 @@
-"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved."""
+"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
+
+A job that says CHOSEN waits until all before it have ended, and gets the form that `choose.py` chooses of them.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import subprocess
 import sys
 import time
 
+import choose
 import jobs
 
 HERE = pathlib.Path(__file__).parent
@@ -57,17 +61,32 @@ def room(running: list[Running], next_run: str) -> int | None:
     return max((gpu for gpu in range(GPUS) if at[gpu] + weight <= jobs.PROGRAMS), key=at.__getitem__, default=None)
 
 
+def chosen() -> str:
+    """What is set in the form that the trial chooses; the first form's if the trial cannot be read."""
+    try:
+        form, scores = choose.form({name: OUT / "runs" / "forms" / name for name in jobs.FORMS})
+    except Exception as error:  # the cells shall run
+        form, scores = next(iter(jobs.FORMS)), repr(error)
+    (OUT / "chosen").write_text(f"{form}: {scores}\n")
+    log("chosen:", form, "of", scores)
+    return f"{jobs.PID} {jobs.FORMS[form]}"
+
+
 def main() -> None:
     if SMOKE:
         shutil.rmtree(OUT, ignore_errors=True)
-    queue, running = list(jobs.JOBS.items()), list[Running]()
+    queue, running, form = list(jobs.JOBS.items()), list[Running](), ""
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        if queue and (free := room(running, queue[0][0])) is not None:
+        waits = queue and jobs.CHOSEN in queue[0][1] and not form
+        if waits and not running:
+            form = chosen()
+        elif queue and not waits and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
+            command = command.replace(jobs.CHOSEN, form)
             running.append((free, name, start(free, name, command.split())))
         else:
             time.sleep(1)
