@@ -62,31 +62,31 @@ def room(running: list[Running], next_run: str) -> int | None:
 
 
 def chosen() -> str:
-    """What is set in the form that the trial chooses; the first form's if the trial cannot be read."""
+    """What is set in the form that the trial chooses; nothing if the trial cannot be read, as the cells shall run."""
     try:
-        form, scores = choose.form({name: OUT / "runs" / "forms" / name for name in jobs.FORMS})
-    except Exception as error:  # the cells shall run
-        form, scores = next(iter(jobs.FORMS)), repr(error)
-    (OUT / "chosen").write_text(f"{form}: {scores}\n")
-    log("chosen:", form, "of", scores)
-    return f"{jobs.PID} {jobs.FORMS[form]}"
+        found = choose.forms(OUT / "runs" / "trial")
+    except Exception as error:
+        log("no form is chosen:", repr(error))
+        return ""
+    log("forms, best first:", *found)
+    return found[0].settings
 
 
 def main() -> None:
     if SMOKE:
         shutil.rmtree(OUT, ignore_errors=True)
-    queue, running, form = list(jobs.JOBS.items()), list[Running](), ""
+    queue, running, form = list(jobs.JOBS.items()), list[Running](), None
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        waits = queue and jobs.CHOSEN in queue[0][1] and not form
+        waits = form is None and bool(queue) and "CHOSEN" in queue[0][1]
         if waits and not running:
             form = chosen()
         elif queue and not waits and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
-            command = command.replace(jobs.CHOSEN, form)
+            command = command.replace("CHOSEN", form or "")
             running.append((free, name, start(free, name, command.split())))
         else:
             time.sleep(1)
