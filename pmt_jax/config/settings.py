@@ -71,6 +71,12 @@ class Hyper:
         "square of its length, so half of lr_half_life shrinks both alike",
         Bound("be a number of steps above 0, or inf", lambda x: x > 0),
     )
+    std_half_life: float = learning(
+        math.inf,
+        "environment steps of a seed in which the noise of actions, their standard deviation, halves, beside what the "
+        "policies learn of it; inf leaves it to them",
+        Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+    )
     max_grad_norm: float = learning(
         10.0,
         "gradients are scaled down to this global norm; inf leaves them. Those of a policy grow with its multiplier",

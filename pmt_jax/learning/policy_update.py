@@ -29,7 +29,7 @@ def update_policies(
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """Updates every agent's policy, then its multipliers.
+    """Updates every agent's policy, then its multipliers; at last the noise of actions falls by its share.
 
     Args:
       rows: leaves [N, R, ...]; cost_excess: [N, K] in cost per step.
@@ -40,6 +40,8 @@ def update_policies(
     update = {"sequential": _sequential, "simultaneous": _simultaneous}[setup.method.order]
     actor, multiplier, metrics = update(setup, hyper, actor, multiplier, rows, cost_excess, tagged)
     kl = metrics.pop("kl_per_agent")
+    std_left = jnp.exp2(-setup.config.batch_size / hyper.std_half_life)
+    actor = dataclasses.replace(actor, params=setup.nets.scale_std(actor.params, std_left))
     return actor, multiplier, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
 
 
