@@ -1,7 +1,4 @@
-"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved.
-
-A job that says CHOSEN waits until all before it have ended, and gets the form that `choose.py` chooses of them.
-"""
+"""Runs the jobs of jobs.py, some at a time on each GPU, until its END; then Ctrl-C, so that training is saved."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import subprocess
 import sys
 import time
 
-import choose
 import jobs
 
 HERE = pathlib.Path(__file__).parent
@@ -61,32 +57,17 @@ def room(running: list[Running], next_run: str) -> int | None:
     return max((gpu for gpu in range(GPUS) if at[gpu] + weight <= jobs.PROGRAMS), key=at.__getitem__, default=None)
 
 
-def chosen() -> str:
-    """What is set in the form that the trial chooses; nothing if the trial cannot be read, as the cells shall run."""
-    try:
-        found = choose.forms(OUT / "runs" / "trial")
-    except Exception as error:
-        log("no form is chosen:", repr(error))
-        return ""
-    log("forms, best first:", *found)
-    return found[0].settings
-
-
 def main() -> None:
     if SMOKE:
         shutil.rmtree(OUT, ignore_errors=True)
-    queue, running, form = list(jobs.JOBS.items()), list[Running](), None
+    queue, running = list(jobs.JOBS.items()), list[Running]()
     while time.time() - BEGIN < END and (queue or running):
         for gpu, name, process in list(running):
             if process.poll() is not None:
                 log(name, "ended with", process.returncode)
                 running.remove((gpu, name, process))
-        waits = form is None and bool(queue) and "CHOSEN" in queue[0][1]
-        if waits and not running:
-            form = chosen()
-        elif queue and not waits and (free := room(running, queue[0][0])) is not None:
+        if queue and (free := room(running, queue[0][0])) is not None:
             name, command = queue.pop(0)
-            command = command.replace("CHOSEN", form or "")
             running.append((free, name, start(free, name, command.split())))
         else:
             time.sleep(1)

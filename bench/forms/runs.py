@@ -16,7 +16,7 @@ from pmt_jax.formats import markdown, number
 from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
-from pmt_jax.studies.statistics import mean_interval, u_test
+from pmt_jax.studies.statistics import iqm, mean_interval, u_test
 from pmt_jax.tasks import columns
 
 from .. import records
@@ -28,6 +28,7 @@ TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_see
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "cost_critic/explained_variance")  # means over seeds
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 WHILE_TRAINING = "cost while training"
+OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
@@ -66,12 +67,16 @@ def _compact(log: RunLog) -> Run:
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
     the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost's curve, whose
-    points count alike.
+    points count alike, and what the last evaluation found.
     """
     found, (row,) = log.thinned(plot.POINTS), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
     if "true_step_cost" in log.metrics:
         scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
+    evaluated = np.isfinite(log.metrics.get("eval/episode_cost", np.empty((0, 0)))).any(0)
+    if evaluated.any():
+        last = np.flatnonzero(evaluated)[-1]
+        scores |= {f"{OF_MEAN_ACTIONS}{x}": log.metrics[f"eval/episode_{x}"][:, last] for x in ("cost", "reward")}
     names = [name for name in (*CURVES, *TRUE_CURVES) if name in found.metrics]
     kept = (*DIAGNOSTICS, *(f"info/{name}" for name in columns(found.task)))
     diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(kept)}
@@ -247,6 +252,21 @@ def as_points(file: pathlib.Path) -> str:
     return markdown(("task", "method", *present), body)
 
 
+def as_mean_actions(file: pathlib.Path) -> str:
+    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions."""
+    found = sorted(load(file), key=lambda run: (run["cost_limit"], run["label"]))
+    body = []
+    for run in found:
+        limit = f"{run['cost_limit']:g}"
+        line = [limit, run["label"].replace(f" cost_limit={limit}", "")]
+        for source in ("", OF_MEAN_ACTIONS):
+            cost, reward = (np.array(run["table"][source + name], float) for name in ("cost", "reward"))
+            line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.0f}"]
+        body.append(line)
+    head = ["limit", "method", "seeds within", "cost", "reward"]
+    return markdown((*head, *(f"mean actions: {name}" for name in head[2:])), body)
+
+
 def as_method(file: pathlib.Path) -> str:
     """The method that `file` is named after on the README's tasks, MAPPO-Lagrangian below it."""
     body = []
@@ -263,6 +283,7 @@ def as_method(file: pathlib.Path) -> str:
 FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "curves": as_pmt_table,
     "points": as_points,
+    "mean_actions": as_mean_actions,
     "method": as_method,
     "paper": as_paper,
     "summary": as_summary,

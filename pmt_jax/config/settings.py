@@ -73,9 +73,15 @@ class Hyper:
     )
     std_half_life: float = learning(
         math.inf,
-        "environment steps of a seed in which the noise of actions, their standard deviation, halves, beside what the "
-        "policies learn of it; inf leaves it to them",
+        "environment steps of a seed in which the noise of actions, their standard deviation, halves after "
+        "std_decay_start, beside what the policies learn of it; inf leaves it to them",
         Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+    )
+    std_decay_start: float = learning(
+        0.0,
+        "environment steps of a seed after which std_half_life counts. A policy needs noise to learn; without it at "
+        "the end, the limit holds for what is deployed",
+        NOT_NEGATIVE,
     )
     max_grad_norm: float = learning(
         10.0,

@@ -149,11 +149,12 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    """`hyper` with the learning rates, and the bounds on a policy's step, after so many updates."""
+    """`hyper` with learning rates, bounds on a policy's step and the fall of its noise after so many updates."""
+    # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
+    steps = update.astype(jnp.float32) * setup.config.batch_size
 
     def left(half_life: jax.Array | float) -> jax.Array:
-        # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
-        return jnp.exp2(-(update.astype(jnp.float32) * setup.config.batch_size / half_life))
+        return jnp.exp2(-(steps / half_life))
 
     rates = {name: getattr(hyper, name) for name in ("actor_lr", "critic_lr", "emotion_lr")}
     rates["fear_lr_start"] = hyper.fear_lr_start / (update + 1)
@@ -162,7 +163,8 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     bounds = {
         name: getattr(hyper, name) * jnp.maximum(left(hyper.kl_half_life), 1e-30) for name in ("kl_max", "kl_limit")
     }
-    return dataclasses.replace(hyper, **rates, **bounds)
+    std_half_life = jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life)
+    return dataclasses.replace(hyper, **rates, **bounds, std_half_life=std_half_life)
 
 
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:

@@ -29,7 +29,7 @@ def update_policies(
     cost_excess: jax.Array,
     tagged: dict[Tag, jax.Array],
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """Updates every agent's policy, then its multipliers; at last the noise of actions falls by its share.
+    """Updates every agent's policy and its multipliers; then the noise of actions falls (`std_half_life`).
 
     Args:
       rows: leaves [N, R, ...]; cost_excess: [N, K] in cost per step.

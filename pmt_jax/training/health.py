@@ -66,7 +66,7 @@ def _extreme_settings(setup: Setup, index: int) -> dict[str, float]:
     values = {name: np.asarray(getattr(hyper, name)) for name in HYPER_FIELDS if name != "cost_limit"}
     own = {name: float(x[index] if x.ndim else x) for name, x in values.items()}
     usual = {name: 1.0 if name.endswith("_lr") else 1e6 for name in own}
-    usual |= {name: math.inf for name in own if name.endswith("_half_life")}
+    usual |= {name: math.inf for name in own if name.endswith("_half_life") or name == "std_decay_start"}
     return {name: x for name, x in own.items() if usual[name] < x < math.inf}
 
 

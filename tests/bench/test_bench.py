@@ -415,6 +415,21 @@ def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
 
 
+def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
+    run = fake_run(tmp_path / "run", cost_limit=1)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    steps = sorted({row["step"] for row in rows})
+    for row in rows:
+        row["cost_limit"] = 1.0
+        if row["step"] in steps[:2]:  # long before the end, whose figures stay those of training
+            at = steps.index(row["step"])
+            row |= {"eval/episode_cost": 7.0 - 3 * at - 4 * row["seed"], "eval/episode_reward": 10.0 * at}
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    runs.store([run], tmp_path / "run.json")
+    line = runs.as_mean_actions(tmp_path / "run.json").splitlines()[2]
+    assert line.startswith("| 1 | happo | ") and line.endswith(" | 1 of 2 | 2.00 | 10 |")
+
+
 def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
     found = stored()["velocity_ant_2x4_h200"]
     one = next(run for run in found if run["method"] == "mixed")

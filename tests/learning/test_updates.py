@@ -167,6 +167,29 @@ def test_bounds_on_a_policys_step_halve_in_their_half_life(start: float):
     assert held.actor_lr.tolist() == [setup.hyper.actor_lr] * 4
 
 
+@pytest.mark.parametrize("start", [0, 16_384])
+def test_noise_falls_after_its_start(start: int):
+    setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
+    hyper = dataclasses.replace(setup.hyper, std_half_life=jnp.float32(1e5), std_decay_start=jnp.float32(start))
+    held = jax.vmap(lambda update: learner._annealed(setup, hyper, update))(jnp.asarray([0, 1, 2, 3], jnp.int32))
+    assert held.std_half_life.tolist() == [math.inf if update * 8192 < start else 1e5 for update in range(4)]
+
+
+@pytest.mark.parametrize("method", ["mappo", "mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
+def test_noise_halves_in_its_half_life_beside_what_is_learned(method: str):
+    """One actor for all agents or one each, clipped epochs or a trust region: all else is learned bit for bit alike."""
+    made = program(method)
+    begin, nets = made.init(made.setup.hyper, jax.random.key(0)), made.setup.nets
+    free, _ = made.step(made.setup.hyper, begin)
+    halved, _ = made.step(made.hyper(std_half_life=made.setup.config.batch_size), begin)
+    obs = jnp.ones((made.setup.vector.spec.num_agents, made.setup.vector.spec.obs_dim))
+    mean, std = nets.policies(free.actor.params, obs)
+    halved_mean, halved_std = nets.policies(halved.actor.params, obs)
+    chex.assert_trees_all_equal(halved_mean, mean)
+    np.testing.assert_allclose(halved_std, std / 2, rtol=1e-6)
+    chex.assert_trees_all_equal((halved.critic, halved.multiplier), (free.critic, free.multiplier))
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["mappo", "r4sg"])
 def test_an_update_moves_no_policy_further_than_kl_max(method: str):
