@@ -28,6 +28,7 @@ from .fields import (
     NOT_NEGATIVE_OR_INF,
     POSITIVE,
     SHARE,
+    STEPS_OR_INF,
     Bound,
     common,
     constraint,
@@ -58,7 +59,7 @@ class Hyper:
     lr_half_life: float = learning(
         math.inf,
         "environment steps of a seed in which all learning rates halve; inf keeps them",
-        Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+        STEPS_OR_INF,
     )
     kl_max: float = learning(
         math.inf,
@@ -69,18 +70,18 @@ class Hyper:
         math.inf,
         "environment steps of a seed in which kl_max and kl_limit halve; inf keeps them. A step's divergence is the "
         "square of its length, so half of lr_half_life shrinks both alike",
-        Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+        STEPS_OR_INF,
     )
     std_half_life: float = learning(
         math.inf,
         "environment steps of a seed in which the noise of actions, their standard deviation, halves after "
         "std_decay_start, beside what the policies learn of it; inf leaves it to them",
-        Bound("be a number of steps above 0, or inf", lambda x: x > 0),
+        STEPS_OR_INF,
     )
     std_decay_start: float = learning(
         0.0,
-        "environment steps of a seed after which std_half_life counts. A policy needs noise to learn; without it at "
-        "the end, the limit holds for what is deployed",
+        "environment steps of a seed after which std_half_life counts: a policy needs noise to learn, so late is "
+        "better",
         NOT_NEGATIVE,
     )
     max_grad_norm: float = learning(
