@@ -147,8 +147,8 @@ class Networks:
 
     def scale_std(self, params: Params, factor: jax.Array) -> Params:
         """An actor's weights with `factor` times the standard deviation, factor in (0, 1]."""
-        return jax.tree.map(
-            lambda x, is_std: jnp.where(is_std, distributions.scaled(x, factor), x), params, self.is_std(params)
+        return jax.tree_util.tree_map_with_path(
+            lambda path, x: distributions.scaled(x, factor) if path[-1].key == "std" else x, params
         )
 
     def layers(self, params: Params) -> dict[str, jax.Array]:
