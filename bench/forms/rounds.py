@@ -269,13 +269,23 @@ def as_beside_f4sg(file: pathlib.Path) -> str:
 
 def as_unclipped(file: pathlib.Path) -> str:
     """Limits: cells without a clip on cost values beside those of the same method, rule and limit with it."""
-    clipped = ("limits_pid_h200", "limits_control_h200", "limits_macpo_02_h200")
-    others = [run for name in clipped for run in runs.load(file.with_name(f"{name}.json"))]
+    return _beside_their_like(file, "limits_pid_h200", "limits_control_h200", "limits_macpo_02_h200")
 
-    def cell(run: runs.Run) -> tuple[Any, ...]:
-        return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
 
-    return beside([[next(x for x in others if cell(x) == cell(run)), run] for run in runs.load(file)])
+def as_less_noise(file: pathlib.Path) -> str:
+    """Limits: cells with less noise at the end beside those of the same method, rule and limit without it."""
+    return _beside_their_like(file, "limits_unclipped_h200")
+
+
+def _beside_their_like(file: pathlib.Path, *names: str) -> str:
+    """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit."""
+    found = [run for name in names for run in runs.load(file.with_name(f"{name}.json"))]
+    like = {(run["method"], settings(run)["lambda_rule"], run["cost_limit"]): run for run in found}
+    groups: dict[tuple[Any, ...], list[runs.Run]] = {}
+    for run in runs.load(file):
+        cell = run["method"], settings(run)["lambda_rule"], run["cost_limit"]
+        groups.setdefault(cell, [like[cell]]).append(run)
+    return beside(list(groups.values()))
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
@@ -351,4 +361,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "beside_mappo_l": as_beside_mappo_l,
     "beside_f4sg": as_beside_f4sg,
     "unclipped": as_unclipped,
+    "less_noise": as_less_noise,
 }
