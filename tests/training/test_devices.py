@@ -19,6 +19,9 @@ from pmt_jax.training import checkpoint, processes
 
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
 ARGUMENTS = ("train", "lane", "--num-envs", 4, *TINY, "--eval-interval", 2, "--eval-episodes", 2, "--seeds", 1)
+# Of MACPO: from here its line search takes the first step at once. With seed 0 and the default it ends where rounding
+# decides whether a step is accepted, and on one machine of several the devices did not agree.
+ACCEPTED = {"seed": 2, "kl_limit": 1e-4}
 FOUR = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
 
 
@@ -108,7 +111,7 @@ def test_warp_steps_each_devices_own_environments():
 
 @pytest.mark.full
 def test_environments_split_under_a_trust_region():
-    found = compare("lane", share_rows=True, method="macpo", seeds=1, num_envs=4)
+    found = compare("lane", share_rows=True, method="macpo", seeds=1, num_envs=4, **ACCEPTED)
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
     assert in_fits(found["collectives"])
 
@@ -116,7 +119,7 @@ def test_environments_split_under_a_trust_region():
 @pytest.mark.full
 @pytest.mark.parametrize(("method", "seeds"), [("macpo", 1), ("mixed", 1), ("mappo", 2)])
 def test_devices_of_a_cpu_fit_whole_networks(method: str, seeds: int):
-    found = compare("lane", method=method, seeds=seeds, num_envs=4)
+    found = compare("lane", method=method, seeds=seeds, num_envs=4, **(ACCEPTED if method == "macpo" else {}))
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["collectives"] and not in_fits(found["collectives"])
 
