@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import shlex
 import tomllib
 from typing import Any
 
@@ -67,7 +68,8 @@ def _find(source: str) -> pathlib.Path:
     if source.endswith(".toml") or os.path.isfile(source):
         return pathlib.Path(source)
     if os.path.isfile(settings := os.path.join(source, "config.toml")):
-        raise UsageError(f"{source} is a run folder; its settings are {settings}")
+        again = shlex.join(["pmt", "train", settings, "--out", source, "--resume"])
+        raise UsageError(f"{source} is a run folder; its settings are {settings}, and this continues it: {again}")
     raise UsageError(f"unknown task '{source}'{did_you_mean(source, known)} (pmt envs lists all)")
 
 

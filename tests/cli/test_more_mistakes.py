@@ -136,7 +136,7 @@ sweep lane --set cost_limit=1,[1,2] --out s | cost_limit has 2 numbers, but task
 sweep empty_list.toml --out s | clip varies over an empty list; give it at least one value
 sweep lane --set clip=0.1,0.2 --out run | run holds a run, not a sweep; choose another --out
 train no_task.toml | no_task.toml names no task; add extends = "TASK"
-train run | run is a run folder; its settings are run/config.toml
+train run | run/config.toml, and this continues it: pmt train run/config.toml --out run --resume
 sweep lane --set env=num_agents=2,agents=3 --out s | task 'lane' has no option 'agents'
 sweep lane --set clip=0.1,0.2 --out file | cannot write into file: File exists; choose another --out
 sweep lane --set clip=a:b --random 2 --out s | random draws need a range
