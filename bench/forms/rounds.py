@@ -280,12 +280,12 @@ def as_less_noise(file: pathlib.Path) -> str:
 def _beside_their_like(file: pathlib.Path, *names: str) -> str:
     """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit."""
     found = [run for name in names for run in runs.load(file.with_name(f"{name}.json"))]
-    like = {(run["method"], settings(run)["lambda_rule"], run["cost_limit"]): run for run in found}
-    groups: dict[tuple[Any, ...], list[runs.Run]] = {}
-    for run in runs.load(file):
-        cell = run["method"], settings(run)["lambda_rule"], run["cost_limit"]
-        groups.setdefault(cell, [like[cell]]).append(run)
-    return beside(list(groups.values()))
+
+    def cell(run: runs.Run) -> tuple[Any, ...]:
+        return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
+
+    like = {cell(run): run for run in found}
+    return beside([[like[cell(run)], run] for run in runs.load(file)])
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:

@@ -61,6 +61,11 @@ def read_preset(name: str) -> Table:
     return read(CONFIG_DIR / _PRESETS / f"{name}.toml")
 
 
+def resume_command(out: str) -> str:
+    """What continues the run in the folder `out`, to be typed into a shell."""
+    return shlex.join(["pmt", "train", os.path.join(out, "config.toml"), "--out", out, "--resume"])
+
+
 def _find(source: str) -> pathlib.Path:
     known = names()
     if source in known:
@@ -68,7 +73,7 @@ def _find(source: str) -> pathlib.Path:
     if source.endswith(".toml") or os.path.isfile(source):
         return pathlib.Path(source)
     if os.path.isfile(settings := os.path.join(source, "config.toml")):
-        again = shlex.join(["pmt", "train", settings, "--out", source, "--resume"])
+        again = resume_command(source)
         raise UsageError(f"{source} is a run folder; its settings are {settings}, and this continues it: {again}")
     raise UsageError(f"unknown task '{source}'{did_you_mean(source, known)} (pmt envs lists all)")
 

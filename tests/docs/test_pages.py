@@ -43,7 +43,7 @@ STATED: dict[str, dict[str, str]] = {
         "limits and margins": "10 25",
         "seeds": "3 107 600 609 660 679 60 80 40 26 127 130",
         "seeds that the study asked for": "15",
-        "seeds of limits_pid_h200.json and limits_unclipped_h200.json": "14 12 11",
+        "seeds of limits_pid_h200.json and limits_unclipped_h200.json": "14 12",
         "multipliers in the stored runs": "15 13 11",
         "cost and reward of the control in limits_unclipped_h200.json": "1.08 4,960",
         "p of the table less_noise, and of rewards beside the control": ".004 .007 .012 .042",
