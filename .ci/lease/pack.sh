@@ -13,9 +13,9 @@ ls -d mujoco mujoco_mjx-* mujoco-3* warp warp_lang* brax brax-* rich rich-* trim
   tar cf - --exclude=__pycache__ --exclude=warp-clang.so --exclude=mujoco/experimental --exclude=warp/tests --exclude=warp/examples \
     --exclude=mujoco/mjx/test_data --exclude='*.mp4' --exclude='_render_filament*' -T - | xz -T2 -9 > "$work/site.tar.xz"
 cd "$here"
-split -n 4 -a 1 "$work/site.tar.xz" "$work/part_"
-for part in 1:a 2:b 3:c 4:d; do
+split -n 5 -a 1 "$work/site.tar.xz" "$work/part_"
+for part in 1:a 2:b 3:c 4:d 5:e; do
   mkdir -p ".p${part%:*}"
   mv "$work/part_${part#*:}" ".p${part%:*}/${part#*:}"
 done
-ls -l .p[1-4]
+ls -l .p[1-5]
