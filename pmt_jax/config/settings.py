@@ -80,9 +80,15 @@ class Hyper:
     )
     std_decay_start: float = learning(
         0.0,
-        "environment steps of a seed after which std_half_life counts: a policy needs noise to learn, so late is "
-        "better",
+        "environment steps of a seed after which std_half_life and actor_lr_half_life count: a policy needs noise to "
+        "learn, so late is better",
         NOT_NEGATIVE,
+    )
+    actor_lr_half_life: float = learning(
+        math.inf,
+        "environment steps of a seed in which actor_lr halves after std_decay_start, besides lr_half_life; inf keeps "
+        "it. Ratios count a step of the mean action in units of the noise, so as long as std_half_life fits",
+        STEPS_OR_INF,
     )
     max_grad_norm: float = learning(
         10.0,

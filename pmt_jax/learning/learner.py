@@ -153,12 +153,13 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
     steps = update.astype(jnp.float32) * setup.config.batch_size
 
-    def left(half_life: jax.Array | float) -> jax.Array:
-        return jnp.exp2(-(steps / half_life))
+    def left(half_life: jax.Array | float, start: jax.Array | float = 0) -> jax.Array:
+        return jnp.exp2(-(jnp.maximum(steps - start, 0) / half_life))
 
     rates = {name: getattr(hyper, name) for name in ("actor_lr", "critic_lr", "emotion_lr")}
     rates["fear_lr_start"] = hyper.fear_lr_start / (update + 1)
     rates = {name: rate * left(hyper.lr_half_life) for name, rate in rates.items()}
+    rates["actor_lr"] *= left(hyper.actor_lr_half_life, hyper.std_decay_start)
     # No share of an infinite bound is 0 times it.
     bounds = {
         name: getattr(hyper, name) * jnp.maximum(left(hyper.kl_half_life), 1e-30) for name in ("kl_max", "kl_limit")
