@@ -4,20 +4,19 @@ from __future__ import annotations
 
 END = 1650.0  # seconds after asking; no checkpoints come home
 
-# The study of limits with a slower multiplier (docs/appendix/preregistration.md, form f).
+# The study of limits with steps that shorten with the noise (docs/appendix/preregistration.md, form g).
 PID = "--cost-value-clip=inf --cost-margin=0.3 --cost-estimate=average --episode-starts=spread --lambda-rule=pid"
 PID += " --lambda-kp=0.5 --lambda-unit=relative --lambda-max=100 --cost-std-floor=0.1"
-LESS_NOISE = "--max-grad-norm=inf --std-half-life=0.75e6 --std-decay-start=7e6"
-FORM_F = f"{PID} {LESS_NOISE} --lambda-lr=0.003"
+LESS_NOISE = "--max-grad-norm=inf --std-half-life=0.5e6 --actor-lr-half-life=0.5e6 --std-decay-start=8e6"
+FORM_G = f"{PID} {LESS_NOISE} --lambda-lr=0.0045 --steps=10e6"
 MACPO = "--cost-value-clip=inf --cost-margin=0.9 --cost-estimate=rate --episode-starts=spread --limit-lr=0.1"
-MACPO += " --rollout-length=8 --log-interval=40"
-AS_BEFORE = f"{MACPO} --kl-limit=0.01 --kl-half-life=3.4e6 --std-half-life=0.5e6 --std-decay-start=8e6"
-LATE_SHORT = f"{MACPO} --kl-limit=0.02 --kl-half-life=1.7e6 --std-half-life=1e6 --std-decay-start=7e6"
+MACPO += " --rollout-length=8 --log-interval=40 --kl-limit=0.01 --kl-half-life=3.4e6 --steps=8e6"
+MACPO += " --std-half-life=1e6"
 
 
-def ants(method: str, limits: str, settings: str, program: str = "-m pmt_jax") -> str:
-    """20 seeds at each limit, side by side in one program."""
-    where = f"{program} sweep paper/ant_2x4 --method={method} --steps=10e6 --seed=680 --seeds=20"
+def ants(method: str, limits: str, settings: str) -> str:
+    """20 seeds at each limit (and of what `settings` sweep), side by side in one program."""
+    where = f"-m pmt_jax sweep paper/ant_2x4 --method={method} --seed=700 --seeds=20"
     return f"{where} {settings} --set cost_limit={limits}"
 
 
@@ -26,12 +25,11 @@ def ants(method: str, limits: str, settings: str, program: str = "-m pmt_jax") -
 PROGRAMS = 1
 WEIGHTS: dict[str, float] = {}
 JOBS = {
-    "cells/f4sg": ants("f4sg", "0.2,1,10", FORM_F),
-    "cells/mappo_l": ants("mappo_l", "0.2,1,10", FORM_F),
-    "cells/macpo_fear-0.2": ants("macpo_fear", "0.2", AS_BEFORE, ".ci/lease/macpo_fear.py"),
-    "cells/macpo-0.2": ants("macpo", "0.2", LATE_SHORT),
-    "cells/macpo-1": ants("macpo", "1", LATE_SHORT),
-    "cells/macpo-10": ants("macpo", "10", LATE_SHORT),
-    "cells/control": ants("mappo_l", "10", f"--cost-value-clip=inf {LESS_NOISE}"),  # Table 1 with the same noise
-    "parts/slower": ants("mappo_l", "0.2,1,10", f"{PID} {LESS_NOISE} --lambda-lr=0.002"),
+    "cells/f4sg": ants("f4sg", "0.2,1,10", FORM_G),
+    "cells/mappo_l": ants("mappo_l", "0.2,1,10", FORM_G),
+    "cells/macpo": ants("macpo", "1,10", f"{MACPO} --std-decay-start=6e6"),
+    "cells/macpo-0.2": ants("macpo", "0.2", f"{MACPO} --set std_decay_start=6e6,5e6"),
+    "cells/control": ants("mappo_l", "10", f"--cost-value-clip=inf {LESS_NOISE} --steps=10e6"),  # Table 1, same noise
+    "parts/slower": ants("mappo_l", "0.2,1,10", f"{PID} {LESS_NOISE} --lambda-lr=0.003 --steps=10e6"),
+    "parts/long_steps": ants("mappo_l", "0.2,1,10", f"{FORM_G} --actor-lr-half-life=inf"),
 }

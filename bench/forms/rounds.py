@@ -277,6 +277,11 @@ def as_less_noise(file: pathlib.Path) -> str:
     return _beside_their_like(file, "limits_unclipped_h200")
 
 
+def as_slower(file: pathlib.Path) -> str:
+    """Limits: cells with a slower multiplier, or another form of MACPO, beside those of the one setting."""
+    return _beside_their_like(file, "limits_less_noise_h100")
+
+
 def _beside_their_like(file: pathlib.Path, *names: str) -> str:
     """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit."""
     found = [run for name in names for run in runs.load(file.with_name(f"{name}.json"))]
@@ -362,4 +367,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "beside_f4sg": as_beside_f4sg,
     "unclipped": as_unclipped,
     "less_noise": as_less_noise,
+    "slower": as_slower,
 }
