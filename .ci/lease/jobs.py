@@ -5,7 +5,7 @@ from __future__ import annotations
 END = 1650.0  # seconds after asking; no checkpoints come home
 
 # The study of limits with steps that shorten with the noise (docs/appendix/preregistration.md, form g).
-PID = "--cost-value-clip=inf --cost-margin=0.3 --cost-estimate=average --episode-starts=spread --lambda-rule=pid"
+PID = "--cost-value-clip=inf --cost-margin=0.2 --cost-estimate=average --episode-starts=spread --lambda-rule=pid"
 PID += " --lambda-kp=0.5 --lambda-unit=relative --lambda-max=100 --cost-std-floor=0.1"
 LESS_NOISE = "--max-grad-norm=inf --std-half-life=0.5e6 --actor-lr-half-life=0.5e6 --std-decay-start=8e6"
 FORM_G = f"{PID} {LESS_NOISE} --lambda-lr=0.0045 --steps=10e6"
