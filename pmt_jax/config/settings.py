@@ -87,7 +87,7 @@ class Hyper:
     actor_lr_half_life: float = learning(
         math.inf,
         "environment steps of a seed in which actor_lr halves after std_decay_start, besides lr_half_life; inf keeps "
-        "it. Ratios count a step of the mean action in units of the noise, so as long as std_half_life fits",
+        "it. Ratios count a step of the mean action in units of the noise: take the length of std_half_life",
         STEPS_OR_INF,
     )
     max_grad_norm: float = learning(
