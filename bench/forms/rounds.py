@@ -34,6 +34,8 @@ from .study import (
 )
 from .tables import markdown
 
+Read = Callable[[Sequence[runs.Run]], list[dict[str, Scores]]]
+
 MEASURES = ("end", "training", "reward")
 AS_IT_IS = {"method": "f4sg", "emotion_lr": 0.001, "fear_lr_start": 0.0}
 A, C, D = (
@@ -277,12 +279,12 @@ def as_less_noise(file: pathlib.Path) -> str:
     return _beside_their_like(file, "limits_unclipped_h200")
 
 
-def as_slower(file: pathlib.Path) -> str:
-    """Limits: cells with a slower multiplier, or another form of MACPO, beside those of the one setting."""
-    return _beside_their_like(file, "limits_less_noise_h100")
+def as_after_less_noise(file: pathlib.Path) -> str:
+    """Limits: cells of a later form beside those of less noise, each at its own end; one without its like is alone."""
+    return _beside_their_like(file, "limits_less_noise_h100", read=_at_their_ends)
 
 
-def _beside_their_like(file: pathlib.Path, *names: str) -> str:
+def _beside_their_like(file: pathlib.Path, *names: str, read: Read | None = None) -> str:
     """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit."""
     found = [run for name in names for run in runs.load(file.with_name(f"{name}.json"))]
 
@@ -290,19 +292,19 @@ def _beside_their_like(file: pathlib.Path, *names: str) -> str:
         return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
 
     like = {cell(run): run for run in found}
-    return beside([[like[cell(run)], run] for run in runs.load(file)])
+    return beside([[*filter(None, [like.get(cell(run))]), run] for run in runs.load(file)], read)
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
 
-def beside(groups: Sequence[Sequence[runs.Run]]) -> str:
+def beside(groups: Sequence[Sequence[runs.Run]], read: Read | None = None) -> str:
     """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure.
 
-    Groups of several tasks have a column for the task.
+    Groups of several tasks have a column for the task. `read` is `_read` if it is None.
     """
-    scores = [_read(cells) for cells in groups]
+    scores = [(read or _read)(cells) for cells in groups]
     pairs = [(i, j) for i, cells in enumerate(groups) for j in range(1, len(cells))]
     corrected = [holm([u_test(scores[i][j][name], scores[i][0][name]) for i, j in pairs]) for name in MEASURES]
     every = [run for cells in groups for run in cells]
@@ -341,6 +343,11 @@ def _read(cells: Sequence[runs.Run], among: Sequence[runs.Run] = ()) -> list[dic
     return [measures(run, last * _environments(run)) for run in cells]
 
 
+def _at_their_ends(cells: Sequence[runs.Run]) -> list[dict[str, Scores]]:
+    """The measures of each cell at its own last update."""
+    return [measures(run, max(run["steps"])) for run in cells]
+
+
 def _environments(run: runs.Run) -> int:
     return settings(run).get("num_envs", Config.num_envs)
 
@@ -367,5 +374,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "beside_f4sg": as_beside_f4sg,
     "unclipped": as_unclipped,
     "less_noise": as_less_noise,
-    "slower": as_slower,
+    "after_less_noise": as_after_less_noise,
 }

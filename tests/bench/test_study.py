@@ -103,6 +103,20 @@ def test_cells_of_a_comparison_are_read_at_the_same_update():
     assert rows[0][-1] == "-" and rows[1][-1].startswith("< .001")
 
 
+def test_a_later_form_is_read_at_its_own_end_and_a_cell_without_its_like_alone(tmp_path: pathlib.Path):
+    """As the limits' study fixed before its runs: MACPO's runs of eight million steps beside those of ten."""
+    falls = [[8.0] * 5 + [2.0] * 5] * 8
+    before = [stored("macpo", 1.0, [2.0] * 8, lambda_rule="integral") | {"true_episode_cost": falls, "cost_limit": 1.0}]
+    (tmp_path / "limits_less_noise_h100.json").write_text(json.dumps(before))
+    short = stored("macpo", 1.0, [4.0] * 8, lambda_rule="integral") | {"cost_limit": 1.0}
+    short["steps"] = [x // 2 for x in short["steps"]]
+    file = tmp_path / "x.json"
+    file.write_text(json.dumps([short, short | {"cost_limit": 10.0}]))
+    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in rounds.as_after_less_noise(file).splitlines()[2:]]
+    assert [row[3] for row in rows] == ["2.0 +- 0.0", "4.0 +- 0.0", "4.0 +- 0.0"]
+    assert [row[-1] == "-" for row in rows] == [True, False, True]
+
+
 def test_why_gives_both_halves_of_the_critic_and_the_ratio_of_fear(tmp_path: pathlib.Path):
     seen = {"cost_critic/explained_variance": [0.2] * 5 + [0.6] * 5}
     fear = {"fear/on_costly": [0.3] * 10, "fear/on_safe": [0.1] * 10, "fear/ece": [0.01] * 10}
