@@ -193,6 +193,12 @@ class Hyper:
     limit_lr: float = constraint(
         0.0, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", SHARE
     )
+    limit_windup: float = constraint(
+        1.0,
+        "the most that limit_lr lowers the limit by, in multiples of what a step can take off the cost; above 1 more "
+        "steps only lower the cost",
+        POSITIVE,
+    )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
     first_step: float = constraint(1.0, "first step of MACPO's line search, as a share of the full step", NOT_NEGATIVE)

@@ -169,7 +169,7 @@ def _update_multiplier(
     if setup.method.constraint == "none":
         return multiplier
     if setup.method.constraint == "trust_region":
-        return lagrangian.lowered_limit(multiplier, cost_excess, hyper.limit_lr, metrics["reach"])
+        return lagrangian.lowered_limit(multiplier, cost_excess, hyper.limit_lr, hyper.limit_windup * metrics["reach"])
     surrogate = lagrangian.surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
     surrogate = hyper.surrogate_weight * surrogate
     excess = in_lambda_unit(setup, hyper, cost_excess + surrogate)

@@ -86,6 +86,7 @@ def test_words_of_a_command_line_become_typed():
         ({"kl_half_life": 0}, "kl_half_life must be a number of steps above 0, or inf"),
         ({"std_half_life": 0}, "std_half_life must be a number of steps above 0, or inf"),
         ({"actor_lr_half_life": -1}, "actor_lr_half_life must be a number of steps above 0, or inf"),
+        ({"limit_windup": 0}, "limit_windup must be a number above 0"),
         ({"std_decay_start": -1}, "std_decay_start must be a number that is not negative"),
         ({"cost_limit": -2}, "cost_limit must be a cost per episode of at least 0"),
         ({"hidden": ()}, "hidden must name at least one layer"),

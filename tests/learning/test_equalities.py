@@ -71,6 +71,19 @@ def test_macpo_keeps_to_the_limit_that_it_lowered():
 
 
 @pytest.mark.full
+def test_macpo_lowers_its_limit_by_no_more_than_limit_windup_allows():
+    made = program("macpo")
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    far = dataclasses.replace(start, multiplier=jnp.full_like(start.multiplier, 1.0))
+    lowered = {}
+    for windup in 1.0, 2.0:  # all the way: a limit_lr of 1
+        after, metrics = made.step(made.hyper(limit_lr=1.0, limit_windup=windup), far)
+        np.testing.assert_allclose(after.multiplier.mean(), windup * metrics["actor/reach"], rtol=1e-5)
+        lowered[windup] = after.multiplier
+    np.testing.assert_allclose(lowered[2.0], 2 * lowered[1.0], rtol=1e-6)
+
+
+@pytest.mark.full
 def test_a_multiplier_in_units_of_the_limit_climbs_alike_below_every_limit():
     made = program("mappo_l", lambda_unit="limit")
     for limit in 1.0, 0.125:  # costs are more than twice as high at first

@@ -75,19 +75,19 @@ def relative_update(
 
 
 def lowered_limit(
-    lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, reach: jax.Array
+    lowered: jax.Array, cost_excess: jax.Array, limit_lr: jax.Array | float, most: jax.Array
 ) -> jax.Array:
     """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
 
     A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where
-    the step can do no more than lower the cost, the sum moves towards what such a step promises instead
-    (anti-windup by back-calculation): more could not act, and it would delay the reward once the limit is kept.
+    the sum is above `most`, it moves down towards it instead (anti-windup by back-calculation): without that, costs
+    far beyond the limit would add up to more than can act, and delay the reward once the limit is kept.
 
     Args:
-      lowered: [...] so far, and cost_excess: S [...], in cost per step; reach: the most that a step promises to take
-        off the cost, in the same unit.
+      lowered: [...] so far, and cost_excess: S [...], in cost per step; most: `limit_windup` times the most that a
+        step promises to take off the cost, in the same unit.
     """
-    return jnp.maximum(lowered + limit_lr * jnp.minimum(cost_excess, reach - lowered), 0.0)
+    return jnp.maximum(lowered + limit_lr * jnp.minimum(cost_excess, most - lowered), 0.0)
 
 
 def pid(
