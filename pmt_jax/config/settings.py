@@ -80,8 +80,8 @@ class Hyper:
     )
     std_decay_start: float = learning(
         0.0,
-        "environment steps of a seed after which std_half_life and actor_lr_half_life count: a policy needs noise to "
-        "learn, so late is better",
+        "environment steps of a seed after which std_half_life, actor_lr_half_life and limit_windup count: a policy "
+        "needs noise to learn, so late is better",
         NOT_NEGATIVE,
     )
     actor_lr_half_life: float = learning(
@@ -195,8 +195,8 @@ class Hyper:
     )
     limit_windup: float = constraint(
         1.0,
-        "the most that limit_lr lowers the limit by, in multiples of what a step can take off the cost; above 1 more "
-        "steps only lower the cost",
+        "the most that limit_lr lowers the limit by after std_decay_start, in multiples of what a step can take off "
+        "the cost; above 1 more steps only lower the cost, and before there is much to lose they end learning",
         POSITIVE,
     )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)

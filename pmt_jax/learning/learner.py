@@ -149,7 +149,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    """`hyper` with learning rates, bounds on a policy's step and the fall of its noise after so many updates."""
+    """`hyper` with learning rates, bounds on a policy's step and what counts late in a run, after so many updates."""
     # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
     steps = update.astype(jnp.float32) * setup.config.batch_size
 
@@ -164,8 +164,12 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     bounds = {
         name: getattr(hyper, name) * jnp.maximum(left(hyper.kl_half_life), 1e-30) for name in ("kl_max", "kl_limit")
     }
-    std_half_life = jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life)
-    return dataclasses.replace(hyper, **rates, **bounds, std_half_life=std_half_life)
+    early = steps < hyper.std_decay_start
+    late = {
+        "std_half_life": jnp.where(early, jnp.inf, hyper.std_half_life),
+        "limit_windup": jnp.where(early, 1.0, hyper.limit_windup),
+    }
+    return dataclasses.replace(hyper, **rates, **bounds, **late)
 
 
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:

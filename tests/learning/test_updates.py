@@ -168,12 +168,13 @@ def test_bounds_on_a_policys_step_halve_in_their_half_life(start: float):
 
 
 @pytest.mark.parametrize("start", [0, 16_384])
-def test_noise_and_the_policies_learning_rate_fall_after_their_start(start: int):
+def test_what_counts_late_in_a_run_counts_after_its_start(start: int):
     setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
-    falls = {"std_half_life": 1e5, "actor_lr_half_life": 8192.0, "std_decay_start": start}
+    falls = {"std_half_life": 1e5, "actor_lr_half_life": 8192.0, "limit_windup": 3.0, "std_decay_start": start}
     hyper = dataclasses.replace(setup.hyper, **{name: jnp.float32(x) for name, x in falls.items()})
     held = jax.vmap(lambda update: learner._annealed(setup, hyper, update))(jnp.asarray([0, 1, 2, 3], jnp.int32))
     assert held.std_half_life.tolist() == [math.inf if update * 8192 < start else 1e5 for update in range(4)]
+    assert held.limit_windup.tolist() == [1 if update * 8192 < start else 3 for update in range(4)]
     halvings = [max(update - start / 8192, 0) for update in range(4)]
     np.testing.assert_allclose(held.actor_lr, [setup.hyper.actor_lr / 2**x for x in halvings], rtol=1e-6)
     assert held.critic_lr.tolist() == [setup.hyper.critic_lr] * 4
