@@ -196,7 +196,7 @@ class Hyper:
     limit_windup: float = constraint(
         1.0,
         "the most that limit_lr lowers the limit by after std_decay_start, in multiples of what a step can take off "
-        "the cost; above 1 more steps only lower the cost, and before there is much to lose they end learning",
+        "the cost; above 1 more steps only lower the cost, which early in a run ends learning",
         POSITIVE,
     )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
