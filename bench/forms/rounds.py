@@ -45,6 +45,21 @@ A, C, D = (
 )  # question b, all with `fear_start` nan
 
 
+def _read(cells: Sequence[runs.Run], among: Sequence[runs.Run] = ()) -> list[dict[str, Scores]]:
+    """The measures of each cell at the last update that all of them, and all of `among`, reached."""
+    last = min(max(run["steps"]) / _environments(run) for run in (*cells, *among))
+    return [measures(run, last * _environments(run)) for run in cells]
+
+
+def _at_their_ends(cells: Sequence[runs.Run]) -> list[dict[str, Scores]]:
+    """The measures of each cell at its own last update."""
+    return [measures(run, max(run["steps"])) for run in cells]
+
+
+def _environments(run: runs.Run) -> int:
+    return settings(run).get("num_envs", Config.num_envs)
+
+
 def as_second(file: pathlib.Path) -> str:
     """The second round: a row a cell; p corrected over the comparisons of one task with F4SG as it is."""
     found = sorted(runs.load(file), key=lambda run: (run["task"], -share(run), -list(NAMES).index(run["method"])))
@@ -280,12 +295,15 @@ def as_less_noise(file: pathlib.Path) -> str:
 
 
 def as_after_less_noise(file: pathlib.Path) -> str:
-    """Limits: cells of a later form beside those of less noise, each at its own end; one without its like is alone."""
+    """Limits: cells of a later form beside those of less noise, each at its own end."""
     return _beside_their_like(file, "limits_less_noise_h100", read=_at_their_ends)
 
 
-def _beside_their_like(file: pathlib.Path, *names: str, read: Read | None = None) -> str:
-    """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit."""
+def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> str:
+    """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit.
+
+    One without its like is alone.
+    """
     found = [run for name in names for run in runs.load(file.with_name(f"{name}.json"))]
 
     def cell(run: runs.Run) -> tuple[Any, ...]:
@@ -299,12 +317,12 @@ def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
 
-def beside(groups: Sequence[Sequence[runs.Run]], read: Read | None = None) -> str:
+def beside(groups: Sequence[Sequence[runs.Run]], read: Read = _read) -> str:
     """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure.
 
-    Groups of several tasks have a column for the task. `read` is `_read` if it is None.
+    Groups of several tasks have a column for the task.
     """
-    scores = [(read or _read)(cells) for cells in groups]
+    scores = [read(cells) for cells in groups]
     pairs = [(i, j) for i, cells in enumerate(groups) for j in range(1, len(cells))]
     corrected = [holm([u_test(scores[i][j][name], scores[i][0][name]) for i, j in pairs]) for name in MEASURES]
     every = [run for cells in groups for run in cells]
@@ -335,21 +353,6 @@ def _cell(found: Sequence[runs.Run], task: str, seen: float, **wanted: Any) -> r
 def _first(cells: Sequence[runs.Run], method: str) -> list[runs.Run]:
     """`cells`, those of the method first."""
     return sorted(cells, key=lambda run: run["method"] != method)
-
-
-def _read(cells: Sequence[runs.Run], among: Sequence[runs.Run] = ()) -> list[dict[str, Scores]]:
-    """The measures of each cell at the last update that all of them, and all of `among`, reached."""
-    last = min(max(run["steps"]) / _environments(run) for run in (*cells, *among))
-    return [measures(run, last * _environments(run)) for run in cells]
-
-
-def _at_their_ends(cells: Sequence[runs.Run]) -> list[dict[str, Scores]]:
-    """The measures of each cell at its own last update."""
-    return [measures(run, max(run["steps"])) for run in cells]
-
-
-def _environments(run: runs.Run) -> int:
-    return settings(run).get("num_envs", Config.num_envs)
 
 
 FORMS: dict[str, Callable[[pathlib.Path], str]] = {

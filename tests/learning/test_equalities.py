@@ -74,7 +74,7 @@ def test_macpo_keeps_to_the_limit_that_it_lowered():
 def test_macpo_lowers_its_limit_by_no_more_than_limit_windup_allows():
     made = program("macpo")
     start = made.init(made.setup.hyper, jax.random.key(0))
-    far = dataclasses.replace(start, multiplier=jnp.full_like(start.multiplier, 1.0))
+    far = dataclasses.replace(start, multiplier=jnp.ones_like(start.multiplier))
     lowered = {}
     for windup in 1.0, 2.0:  # all the way: a limit_lr of 1
         after, metrics = made.step(made.hyper(limit_lr=1.0, limit_windup=windup), far)
