@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pmt_jax.config.settings import Config
-from pmt_jax.studies.statistics import holm, probability_of_improvement, u_test
+from pmt_jax.studies.statistics import holm, iqm, probability_of_improvement, u_test
 
 from . import runs
 from .study import (
@@ -299,6 +299,24 @@ def as_after_less_noise(file: pathlib.Path) -> str:
     return _beside_their_like(file, "limits_less_noise_h100", read=_at_their_ends)
 
 
+def as_noise_in_time(file: pathlib.Path) -> str:
+    """Limits: noise of actions, cost and seeds within in each half million steps from six million on.
+
+    The standard deviation is the seeds' mean, the cost their interquartile mean; a seed's cost is that of its rows.
+    """
+    width, found, body = 0.5e6, runs.load(file), []
+    ends = np.arange(6.5e6, max(max(run["steps"]) for run in found), width)
+    for run in found:
+        windows = [(np.array(run["steps"]) > end - width) & (np.array(run["steps"]) <= end) for end in ends]
+        costs = [np.nanmean(np.array(run["episode_cost"], float)[:, at], axis=1) for at in windows]
+        std = [np.array(run["diagnostics"]["actor/std"], float)[at].mean() for at in windows]
+        name = label(run, found)
+        body.append([name, "standard deviation", *(f"{x:.3f}" for x in std)])
+        body.append([name, "cost", *(f"{iqm(x):.2f}" for x in costs)])
+        body.append([name, "seeds within", *(f"{(x <= run['cost_limit']).sum()}" for x in costs)])
+    return markdown(["cell", "of half a million steps", *(f"to {x / 1e6:g} M" for x in ends)], body)
+
+
 def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> str:
     """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit.
 
@@ -378,4 +396,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "unclipped": as_unclipped,
     "less_noise": as_less_noise,
     "after_less_noise": as_after_less_noise,
+    "noise_in_time": as_noise_in_time,
 }
