@@ -25,6 +25,7 @@ Run = dict[str, Any]
 
 CURVES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode_length")
 TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_seen have none
+# Stored as means over seeds.
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 WHILE_TRAINING = "cost while training"
