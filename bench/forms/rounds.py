@@ -307,9 +307,10 @@ def as_noise_in_time(file: pathlib.Path) -> str:
     width, found, body = 0.5e6, runs.load(file), []
     ends = np.arange(6.5e6, max(max(run["steps"]) for run in found), width)
     for run in found:
-        windows = [(np.array(run["steps"]) > end - width) & (np.array(run["steps"]) <= end) for end in ends]
-        costs = [np.nanmean(np.array(run["episode_cost"], float)[:, at], axis=1) for at in windows]
-        std = [np.array(run["diagnostics"]["actor/std"], float)[at].mean() for at in windows]
+        log, noise = runs.curves(run), np.array(run["diagnostics"]["actor/std"], float)
+        windows = [(log.steps > end - width) & (log.steps <= end) for end in ends]
+        costs = [np.nanmean(log.metrics["episode_cost"][:, at], axis=1) for at in windows]
+        std = [noise[at].mean() for at in windows]
         name = label(run, found)
         body.append([name, "standard deviation", *(f"{x:.3f}" for x in std)])
         body.append([name, "cost", *(f"{iqm(x):.2f}" for x in costs)])
