@@ -80,14 +80,15 @@ class Hyper:
     )
     std_decay_start: float = learning(
         0.0,
-        "environment steps of a seed after which std_half_life, actor_lr_half_life and limit_windup count: a policy "
-        "needs noise to learn, so late is better",
+        "environment steps of a seed after which std_half_life and actor_lr_half_life count: a policy needs noise to "
+        "learn, so late is better",
         NOT_NEGATIVE,
     )
     actor_lr_half_life: float = learning(
         math.inf,
-        "environment steps of a seed in which actor_lr halves after std_decay_start, besides lr_half_life; inf keeps "
-        "it. Ratios count a step of the mean action in units of the noise: take the length of std_half_life",
+        "environment steps of a seed in which the steps of policies halve after std_decay_start: actor_lr and, by its "
+        "square, kl_limit; inf keeps them. Ratios count a step of the mean action in units of the noise: take the "
+        "length of std_half_life",
         STEPS_OR_INF,
     )
     max_grad_norm: float = learning(
@@ -195,9 +196,9 @@ class Hyper:
     )
     limit_windup: float = constraint(
         1.0,
-        "the most that limit_lr lowers the limit by after std_decay_start, in multiples of what a step can take off "
-        "the cost; above 1 more steps only lower the cost, which early in a run ends learning",
-        POSITIVE,
+        "the most that limit_lr lowers the limit by, in multiples of what a step can take off the cost, and at most "
+        "what a step of the first kl_limit could; above 1 more steps only lower the cost as kl_half_life shortens them",
+        Bound("be a number above 0, or inf", lambda x: x > 0),
     )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)

@@ -159,17 +159,16 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     rates = {name: getattr(hyper, name) for name in ("actor_lr", "critic_lr", "emotion_lr")}
     rates["fear_lr_start"] = hyper.fear_lr_start / (update + 1)
     rates = {name: rate * left(hyper.lr_half_life) for name, rate in rates.items()}
-    rates["actor_lr"] *= left(hyper.actor_lr_half_life, hyper.std_decay_start)
-    # No share of an infinite bound is 0 times it.
-    bounds = {
-        name: getattr(hyper, name) * jnp.maximum(left(hyper.kl_half_life), 1e-30) for name in ("kl_max", "kl_limit")
-    }
-    early = steps < hyper.std_decay_start
+    shorter = left(hyper.actor_lr_half_life, hyper.std_decay_start)
+    rates["actor_lr"] *= shorter
+    kl_left = left(hyper.kl_half_life)
     late = {
-        "std_half_life": jnp.where(early, jnp.inf, hyper.std_half_life),
-        "limit_windup": jnp.where(early, 1.0, hyper.limit_windup),
+        "kl_max": hyper.kl_max * jnp.maximum(kl_left, 1e-30),  # no share of an infinite bound is 0 times it
+        "kl_limit": hyper.kl_limit * jnp.maximum(kl_left * shorter**2, 1e-30),
+        "std_half_life": jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life),
+        "limit_windup": jnp.minimum(hyper.limit_windup, 1 / jnp.sqrt(jnp.maximum(kl_left, 1e-30))),
     }
-    return dataclasses.replace(hyper, **rates, **bounds, **late)
+    return dataclasses.replace(hyper, **rates, **late)
 
 
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:

@@ -157,26 +157,32 @@ def test_learning_rates_of_all_networks_halve_in_their_half_life():
         chex.assert_trees_all_equal(second.actor, made.step(plain, first)[0].actor)
 
 
-@pytest.mark.parametrize("start", [0.03, math.inf])
-def test_bounds_on_a_policys_step_halve_in_their_half_life(start: float):
+@pytest.mark.parametrize(("start", "windup"), [(0.03, 2.0), (math.inf, math.inf)])
+def test_bounds_on_a_policys_step_halve_in_their_half_life(start: float, windup: float):
     setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
     hyper = dataclasses.replace(setup.hyper, kl_max=start, kl_limit=start, kl_half_life=jnp.float32(8192))
     held = jax.vmap(lambda update: learner._annealed(setup, hyper, update))(jnp.asarray([0, 1, 3, 2**20], jnp.int32))
     for bound in (held.kl_max, held.kl_limit):
         np.testing.assert_allclose(bound, [start, start / 2, start / 8, start * 1e-30], rtol=1e-6)
+    # The reach of a step is the root of its bound, so this times the reach is that of a first step.
+    assert held.limit_windup.tolist() == [1] * 4
+    wide = dataclasses.replace(hyper, limit_windup=jnp.float32(windup))
+    held = jax.vmap(lambda update: learner._annealed(setup, wide, update))(jnp.asarray([0, 1, 3, 2**20], jnp.int32))
+    np.testing.assert_allclose(held.limit_windup, np.minimum([1, 2**0.5, 8**0.5, 1e15], windup), rtol=1e-6)
     assert held.actor_lr.tolist() == [setup.hyper.actor_lr] * 4
 
 
 @pytest.mark.parametrize("start", [0, 16_384])
 def test_what_counts_late_in_a_run_counts_after_its_start(start: int):
     setup = make_setup(load_config("lane", num_envs=128, rollout_length=64))
-    falls = {"std_half_life": 1e5, "actor_lr_half_life": 8192.0, "limit_windup": 3.0, "std_decay_start": start}
+    falls = {"std_half_life": 1e5, "actor_lr_half_life": 8192.0, "std_decay_start": start}
     hyper = dataclasses.replace(setup.hyper, **{name: jnp.float32(x) for name, x in falls.items()})
     held = jax.vmap(lambda update: learner._annealed(setup, hyper, update))(jnp.asarray([0, 1, 2, 3], jnp.int32))
     assert held.std_half_life.tolist() == [math.inf if update * 8192 < start else 1e5 for update in range(4)]
-    assert held.limit_windup.tolist() == [1 if update * 8192 < start else 3 for update in range(4)]
     halvings = [max(update - start / 8192, 0) for update in range(4)]
     np.testing.assert_allclose(held.actor_lr, [setup.hyper.actor_lr / 2**x for x in halvings], rtol=1e-6)
+    np.testing.assert_allclose(held.kl_limit, [setup.hyper.kl_limit / 4**x for x in halvings], rtol=1e-6)
+    assert held.kl_max.tolist() == [setup.hyper.kl_max] * 4
     assert held.critic_lr.tolist() == [setup.hyper.critic_lr] * 4
 
 
