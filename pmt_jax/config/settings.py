@@ -27,6 +27,7 @@ from .fields import (
     NOT_NEGATIVE,
     NOT_NEGATIVE_OR_INF,
     POSITIVE,
+    POSITIVE_OR_INF,
     SHARE,
     STEPS_OR_INF,
     Bound,
@@ -94,7 +95,7 @@ class Hyper:
     max_grad_norm: float = learning(
         10.0,
         "gradients are scaled down to this global norm; inf leaves them. Those of a policy grow with its multiplier",
-        Bound("be a number above 0, or inf", lambda x: x > 0),
+        POSITIVE_OR_INF,
     )
     gamma: float = learning(0.99, "discount per control step, for reward and cost alike", SHARE)
     gae_lambda: float = learning(0.95, "lambda of generalised advantage estimation, for reward and cost alike", SHARE)
@@ -198,7 +199,7 @@ class Hyper:
         1.0,
         "the most that limit_lr lowers the limit by, in multiples of what a step can take off the cost, and at most "
         "what a step of the first kl_limit could; above 1 more steps only lower the cost as kl_half_life shortens them",
-        Bound("be a number above 0, or inf", lambda x: x > 0),
+        POSITIVE_OR_INF,
     )
     kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)

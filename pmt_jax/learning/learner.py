@@ -149,7 +149,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
 
 def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
-    """`hyper` with learning rates, bounds on a policy's step and what counts late in a run, after so many updates."""
+    """`hyper` after so many updates: learning rates, bounds on a policy's step, and how its noise falls."""
     # Steps are counted in f32: as int32 they overflow after 2.1e9 steps of a seed.
     steps = update.astype(jnp.float32) * setup.config.batch_size
 
@@ -162,13 +162,13 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     shorter = left(hyper.actor_lr_half_life, hyper.std_decay_start)
     rates["actor_lr"] *= shorter
     kl_left = left(hyper.kl_half_life)
-    late = {
+    bounds = {
         "kl_max": hyper.kl_max * jnp.maximum(kl_left, 1e-30),  # no share of an infinite bound is 0 times it
         "kl_limit": hyper.kl_limit * jnp.maximum(kl_left * shorter**2, 1e-30),
-        "std_half_life": jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life),
         "limit_windup": jnp.minimum(hyper.limit_windup, 1 / jnp.sqrt(jnp.maximum(kl_left, 1e-30))),
     }
-    return dataclasses.replace(hyper, **rates, **late)
+    std_half_life = jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life)
+    return dataclasses.replace(hyper, **rates, **bounds, std_half_life=std_half_life)
 
 
 def _act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.Array]) -> tuple[LearnerState, Batch]:
