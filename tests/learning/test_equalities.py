@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import chex
 import jax
@@ -74,13 +75,25 @@ def test_macpo_keeps_to_the_limit_that_it_lowered():
 def test_macpo_lowers_its_limit_by_no_more_than_limit_windup_allows():
     made = program("macpo")
     start = made.init(made.setup.hyper, jax.random.key(0))
-    far = dataclasses.replace(start, multiplier=jnp.ones_like(start.multiplier))
-    lowered = {}
-    for windup in 1.0, 2.0:  # all the way: a limit_lr of 1
-        after, metrics = made.step(made.hyper(limit_lr=1.0, limit_windup=windup), far)
-        np.testing.assert_allclose(after.multiplier.mean(), windup * metrics["actor/reach"], rtol=1e-5)
-        lowered[windup] = after.multiplier
-    np.testing.assert_allclose(lowered[2.0], 2 * lowered[1.0], rtol=1e-6)
+    # After two half-lives of the trust region a step reaches half as far as the first did.
+    far = dataclasses.replace(start, multiplier=jnp.ones_like(start.multiplier), update=jnp.int32(2))
+    for windup, counted in (1.0, 1.0), (1.5, 1.5), (math.inf, 2.0):
+        hyper = made.hyper(limit_lr=1.0, limit_windup=windup, kl_half_life=made.setup.config.batch_size)
+        after, metrics = made.step(hyper, far)  # all the way: a limit_lr of 1
+        np.testing.assert_allclose(after.multiplier.mean(), counted * metrics["actor/reach"], rtol=1e-5)
+
+
+@pytest.mark.full
+def test_macpos_steps_halve_in_actor_lr_half_life():
+    made = program("macpo")
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    shorter = made.hyper(actor_lr_half_life=made.setup.config.batch_size)
+    first, _ = made.step(shorter, start)
+    chex.assert_trees_all_equal(first, made.step(made.setup.hyper, start)[0])
+    quarter = made.hyper(kl_limit=made.setup.hyper.kl_limit / 4)  # a step's divergence is the square of its length
+    chex.assert_trees_all_equal(made.step(shorter, first)[0], made.step(quarter, first)[0])
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_equal(made.step(shorter, first)[0].actor, made.step(made.setup.hyper, first)[0].actor)
 
 
 @pytest.mark.full
