@@ -161,11 +161,11 @@ def _annealed(setup: Setup, hyper: Hyper, update: jax.Array) -> Hyper:
     rates = {name: rate * left(hyper.lr_half_life) for name, rate in rates.items()}
     shorter = left(hyper.actor_lr_half_life, hyper.std_decay_start)
     rates["actor_lr"] *= shorter
-    kl_left = left(hyper.kl_half_life)
+    kl_left = jnp.maximum(left(hyper.kl_half_life), 1e-30)  # no share of an infinite bound is 0 times it
     bounds = {
-        "kl_max": hyper.kl_max * jnp.maximum(kl_left, 1e-30),  # no share of an infinite bound is 0 times it
+        "kl_max": hyper.kl_max * kl_left,
         "kl_limit": hyper.kl_limit * jnp.maximum(kl_left * shorter**2, 1e-30),
-        "limit_windup": jnp.minimum(hyper.limit_windup, 1 / jnp.sqrt(jnp.maximum(kl_left, 1e-30))),
+        "limit_windup": jnp.minimum(hyper.limit_windup, 1 / jnp.sqrt(kl_left)),
     }
     std_half_life = jnp.where(steps < hyper.std_decay_start, jnp.inf, hyper.std_half_life)
     return dataclasses.replace(hyper, **rates, **bounds, std_half_life=std_half_life)

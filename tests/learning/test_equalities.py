@@ -90,10 +90,11 @@ def test_macpos_steps_halve_in_actor_lr_half_life():
     shorter = made.hyper(actor_lr_half_life=made.setup.config.batch_size)
     first, _ = made.step(shorter, start)
     chex.assert_trees_all_equal(first, made.step(made.setup.hyper, start)[0])
+    second, _ = made.step(shorter, first)
     quarter = made.hyper(kl_limit=made.setup.hyper.kl_limit / 4)  # a step's divergence is the square of its length
-    chex.assert_trees_all_equal(made.step(shorter, first)[0], made.step(quarter, first)[0])
+    chex.assert_trees_all_equal(second, made.step(quarter, first)[0])
     with pytest.raises(AssertionError):
-        chex.assert_trees_all_equal(made.step(shorter, first)[0].actor, made.step(made.setup.hyper, first)[0].actor)
+        chex.assert_trees_all_equal(second.actor, made.step(made.setup.hyper, first)[0].actor)
 
 
 @pytest.mark.full
