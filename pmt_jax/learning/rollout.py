@@ -149,23 +149,6 @@ def cost_beyond(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) ->
     return jnp.where(cost > limit * (1 + 1e-6), cost - limit, 0.0)
 
 
-def episode_cost_estimate(batch: Batch, previous: jax.Array, how: str, horizon: int) -> jax.Array:
-    """The undiscounted cost per episode [N, K] that the multiplier is updated with.
-
-    `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
-    times the horizon; no lag, for batches much shorter than an episode. `average`: the rate's moving average, in which
-    a batch has the weight of its share of an episode's time. It is for an excess that is cut (`lagrangian.in_limits`):
-    where few batches have costs, cut rates are lower on average than the rate is.
-    """
-    rate = horizon * batch.cost.mean((0, 1))
-    if how == "rate":
-        return rate
-    if how == "average":
-        return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
-    finished = finished_mean(batch, batch.episode_cost)
-    return jnp.where(batch.finished.any(), finished, previous)
-
-
 def summary(batch: Batch) -> dict[str, jax.Array]:
     """Metrics of a batch, scalars; episode metrics are means over the episodes that ended (nan if none did).
 

@@ -117,6 +117,21 @@ class Batch:
 
 
 @pytree
+class Constraint:
+    """What the costs of each agent are held by, all [N, K] (see constraint.py).
+
+    Attributes:
+      estimate: undiscounted cost per episode.
+      multiplier: lambda, of PID its integral; 0 without a multiplier.
+      lowered: by how much a trust region keeps below the limit, in cost per step; else 0.
+    """
+
+    estimate: jax.Array
+    multiplier: jax.Array
+    lowered: jax.Array
+
+
+@pytree
 class PolicyRows:
     """The rows of a policy update; R = T * B rows, with a leading [N] before an agent is chosen.
 
@@ -164,9 +179,7 @@ class LearnerState(ActingState):
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         without them.
-      multiplier: [N, K], lambda; with `lambda_rule = pid` its integral; of MACPO what its limit is lowered by,
-        in cost per step.
-      episode_cost: [N, K], the estimate of the undiscounted cost per episode that the multiplier is updated with.
+      constraint: estimate of the cost, multiplier and lowered limit, [N, K].
       state_moments: [S], of raw states.
       rollout: environments and running sums.
       key: the run's key; update u draws from fold_in(key, u).
@@ -176,8 +189,7 @@ class LearnerState(ActingState):
     cost_critic: Critic
     fear: TrainState | None
     regret: TrainState | None
-    multiplier: jax.Array
-    episode_cost: jax.Array
+    constraint: Constraint
     state_moments: RunningMoments
     rollout: RolloutState
     key: jax.Array

@@ -1,10 +1,12 @@
-"""Losses: the clipped surrogate on the hybrid advantage (Eq. 10) and the clipped Huber loss of values (Eq. 12)."""
+"""Losses: of policies (Eq. 10), of values (Eq. 12), and of the emotions' prior networks (Eq. 4 and 14)."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 import optax
+
+SMOOTHING = 0.01
 
 
 def hybrid_advantage(advantage: jax.Array, cost_advantage: jax.Array, multiplier: jax.Array) -> jax.Array:
@@ -53,3 +55,43 @@ def value_loss(value: jax.Array, old_value: jax.Array, target: jax.Array, clip: 
     """
     clipped = old_value + jnp.clip(value - old_value, -clip, clip)
     return jnp.maximum(huber(target - value), huber(target - clipped))
+
+
+def cross_entropy(logits: jax.Array, target: jax.Array) -> jax.Array:
+    """-p log sigmoid(l) - (1 - p) log(1 - sigmoid(l)), elementwise: the logits [...], and p [...] in [0, 1].
+
+    It is KL(p || sigmoid(l)) but for a term that no weight moves, and its minimiser is p itself.
+    """
+    return jax.nn.softplus(logits) - target * logits
+
+
+def bernoulli_kl(p: jax.Array, q: jax.Array) -> jax.Array:
+    """KL(Bernoulli(p) || Bernoulli(q)) in nats, elementwise; both are kept off 0 and 1 by 1e-6."""
+    p, q = jnp.clip(p, 1e-6, 1 - 1e-6), jnp.clip(q, 1e-6, 1 - 1e-6)
+    return p * jnp.log(p / q) + (1 - p) * jnp.log((1 - p) / (1 - q))
+
+
+def smoothed(target: jax.Array) -> jax.Array:
+    """A probability [...] kept off 0 and 1 by 0.01, so that a divergence from it stays finite."""
+    return target * (1 - 2 * SMOOTHING) + SMOOTHING
+
+
+def appraisal_loss(
+    distance: jax.Array, logits: jax.Array, old: jax.Array, weight: jax.Array, l2: jax.Array | float
+) -> jax.Array:
+    """Mean over weighted entries: distance from the target plus `l2` times the squared change since collection.
+
+    This is Eq. 4 for fear and Eq. 14 for regret.
+
+    Fear's target is the observed cost, regret's is how deliberate a costly action was; nothing else differs.
+
+    Args:
+      distance: [...] of the logits from the target, `cross_entropy` or another divergence.
+      logits: [...] of the appraisal now; old: [...] the appraisal remembered from collection, in [0, 1].
+      weight: [...] 1 where the entry counts; with no weight at all the loss and its gradient are exactly 0.
+
+    Returns:
+      [] scalar.
+    """
+    each = distance + l2 * (jax.nn.sigmoid(logits) - old) ** 2
+    return jnp.sum(weight * each) / jnp.maximum(jnp.sum(weight), 1.0)

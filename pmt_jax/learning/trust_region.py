@@ -1,19 +1,127 @@
-"""A constrained trust-region step (CPO; MACPO takes one per agent): conjugate gradient, exact dual, line search."""
+"""MACPO's policy step: CPO's constrained trust region for one agent (Achiam et al., 2017; Gu et al., 2023).
+
+From top to bottom: the steps on the parts of a batch, one step, its direction by the exact dual, the line search.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
-from .pytree import pytree
+from . import sharding
+from .maths import distributions
+from .maths.pytree import pytree
+from .optimise import shuffled
+from .schedules import Schedule
+from .setup import Setup
+from .types import Hyper, Metrics, PolicyRows, TrainState
 
 EPS = 1e-8
 LINE_SEARCH_STEPS = 10
 
 Hvp = Callable[[jax.Array], jax.Array]
+
+
+def trust_region_steps(
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    net: TrainState,
+    rows: PolicyRows,
+    violation: jax.Array,
+    key: jax.Array,
+) -> tuple[TrainState, jax.Array, Metrics]:
+    """`trust_steps` constrained steps (MACPO), each on its part of the shuffled rows; one step takes the whole batch.
+
+    The optimiser's state is not touched. With several costs each step constrains the one most beyond its limit.
+
+    Args:
+      violation: [K] cost per step, how far each cost is beyond what it is held to.
+
+    Returns:
+      the network; [] cost per step, the most that a step promised to take off the cost; metrics. Means over steps.
+    """
+    start, unravel = ravel_pytree(net.params)
+    spread = rows.cost_advantage.std(0) + 1e-5
+    worst = jnp.argmax(violation / spread)
+    rows = dataclasses.replace(rows, cost_advantage=rows.cost_advantage[:, worst])
+    steps = setup.config.trust_steps
+    if steps > 1:
+        shuffle = shuffled(key, rows.log_prob.shape[0])
+        rows = jax.tree.map(lambda x: x[shuffle], rows)
+    parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), rows)
+
+    def one_step(flat: jax.Array, part: PolicyRows) -> tuple[jax.Array, Metrics]:
+        return _trust_region_step(setup, hyper, now, flat, unravel, part, violation[worst])
+
+    flat, metrics = jax.lax.scan(one_step, start, parts)
+    metrics = {name: x.mean(0) for name, x in metrics.items()}
+    return TrainState(unravel(flat), net.opt_state), metrics["reach"], metrics
+
+
+def _trust_region_step(
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    start: jax.Array,
+    unravel: Callable[[jax.Array], Any],
+    rows: PolicyRows,
+    violation: jax.Array,
+) -> tuple[jax.Array, Metrics]:
+    """One constrained step from the flat weights `start` [P]: direction, line search.
+
+    This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
+    """
+    rows = sharding.shard(rows)
+
+    def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return setup.nets.policy(unravel(flat), rows.obs)
+
+    mean0, std0 = jax.lax.stop_gradient(policy(start))
+
+    def objectives(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Loss and cost surrogates."""
+        mean, std = policy(flat)
+        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
+        ratio = jnp.exp(log_ratio + rows.log_weight)  # weighted by regret as in Eq. 15
+        return -jnp.mean(rows.factor * ratio * rows.advantage), jnp.mean(rows.factor * ratio * rows.cost_advantage)
+
+    def divergence(flat: jax.Array) -> jax.Array:
+        return distributions.kl(mean0, std0, *policy(flat), rows.mask).mean()
+
+    (loss0, cost0), pull = jax.vjp(objectives, start)
+    one, zero = jnp.ones_like(loss0), jnp.zeros_like(loss0)
+    (g,), (b,) = pull((one, zero)), pull((zero, one))
+    _, fisher = jax.linearize(jax.grad(divergence), start)
+    # What the steps before this one are expected to have changed counts towards the limit.
+    c = violation + cost0 - jnp.mean(rows.factor * jnp.exp(rows.log_weight) * rows.cost_advantage)
+    uncoupled, _ = ravel_pytree(setup.nets.is_std(unravel(start)))
+    direction = constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, now.kl_limit, uncoupled)
+
+    def accept(flat: jax.Array) -> jax.Array:
+        loss, cost = objectives(flat)
+        kl = divergence(flat)
+        better = (loss < loss0) | (direction.case <= 1)
+        safe = cost - cost0 <= jnp.maximum(-c, 0.0)
+        finite = jnp.isfinite(loss) & jnp.isfinite(cost) & jnp.isfinite(kl)
+        return (kl <= hyper.kl_slack * now.kl_limit) & better & safe & finite
+
+    flat, tried = backtrack(accept, start, direction.step, hyper.first_step, hyper.step_decay)
+    loss, _ = objectives(flat)
+    _, std = policy(flat)
+    return flat, {
+        "loss": loss,
+        "entropy": distributions.entropy(std, rows.mask).mean(),
+        "std": (std * rows.mask).sum() / rows.mask.sum(),
+        "case": direction.case.astype(loss.dtype),
+        "reach": direction.reach,
+        "line_search_steps": tried.astype(loss.dtype),
+    }
 
 
 @pytree

@@ -1,0 +1,231 @@
+"""The constraint, from the costs of a batch to what the policies pay for them.
+
+    costs -> estimate of an episode's cost -> excess over the limit (Eq. 11) -> price in the policies' loss (Eq. 10)
+          -> the policies change -> the multiplier's step (Eq. 16, 17)
+
+A trust region has no multiplier. It keeps the limit itself, and lowers it while costs stay beyond it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from .rollout import finished_mean
+from .schedules import Schedule
+from .setup import Setup
+from .types import Batch, Constraint, Hyper, Metrics, PolicyRows
+
+LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
+
+
+def init(setup: Setup, hyper: Hyper) -> Constraint:
+    """The constraint before the first update: the estimate is the target, so that there is no excess yet."""
+    heads = (setup.vector.spec.num_agents, setup.vector.spec.num_costs)
+    return Constraint(
+        estimate=jnp.full(heads, target(hyper)),
+        multiplier=jnp.full(heads, hyper.lambda_init * (setup.method.constraint == "lagrangian")),
+        lowered=jnp.zeros(heads),
+    )
+
+
+def target(hyper: Hyper) -> jax.Array:
+    """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
+    return jnp.asarray(hyper.cost_limit) * (1 - hyper.cost_margin)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Estimate and excess
+
+
+def estimate_cost(setup: Setup, hyper: Hyper, previous: jax.Array, batch: Batch, cost_value: jax.Array) -> jax.Array:
+    """The undiscounted cost per episode [N, K] that the constraint is held against (`cost_estimate`).
+
+    `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
+    times the horizon; no lag, for batches much shorter than an episode. `average`: the rate's moving average, in which
+    a batch has the weight of its share of an episode's time. It is for an excess that is cut (`relative_excess`):
+    where few batches have costs, cut rates are lower on average than the rate is. `critic`: (1 - gamma) times the
+    mean cost value, times the horizon.
+
+    Args:
+      previous: [N, K], the estimate before; cost_value: [T, B, N, K] of the batch's states.
+    """
+    horizon = setup.vector.horizon
+    rate = horizon * batch.cost.mean((0, 1))
+    match setup.config.cost_estimate:
+        case "critic":
+            return (1 - hyper.gamma) * horizon * cost_value.mean((0, 1))
+        case "rate":
+            return rate
+        case "average":
+            return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
+        case "episode":
+            return jnp.where(batch.finished.any(), finished_mean(batch, batch.episode_cost), previous)
+
+
+def cost_excess(episode_cost: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
+    """How far the cost is beyond its limit, as cost per step: S = (J - d) / L; positive is too dangerous (Eq. 11).
+
+    Args:
+      episode_cost: J [...], undiscounted cost per episode; limit: d in the same unit; horizon: L, in steps.
+    """
+    return (episode_cost - limit) / horizon
+
+
+def relative_excess(excess: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
+    """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
+
+    An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit. Where a
+    margin is kept, the excess over `target` can be a share of the limit or of the target.
+    """
+    return jnp.clip(excess * horizon / jnp.maximum(limit, 1e-6), -1.0, 1.0)
+
+
+def excess_in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:
+    """An excess [..., K] in cost per step, in the unit that the multiplier's gains are for (`lambda_unit`)."""
+    if setup.config.lambda_unit == "step":
+        return excess
+    # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
+    limit = target(hyper) if setup.config.lambda_unit == "relative" else jnp.asarray(hyper.cost_limit)
+    return relative_excess(excess, limit, setup.vector.horizon)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The multiplier: what a cost counts in the policies' loss, and its step
+
+
+def price(setup: Setup, hyper: Hyper, multiplier: jax.Array, excess: jax.Array, estimate: jax.Array) -> jax.Array:
+    """What the policies weigh costs with [N, K]: the multiplier, which PID takes as its integral, and two gains more.
+
+    Args:
+      multiplier: [N, K]; excess: [N, K] of this update, in cost per step; estimate: [N, K] of the update before.
+    """
+    if setup.method.constraint != "lagrangian":
+        return multiplier
+    previous = cost_excess(estimate, target(hyper), setup.vector.horizon)
+    now, before = (excess_in_lambda_unit(setup, hyper, x) for x in (excess, previous))
+    return pid(multiplier, now, before, hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max)
+
+
+def pid(
+    integral: jax.Array,
+    excess: jax.Array,
+    previous_excess: jax.Array,
+    lambda_kp: jax.Array | float,
+    lambda_kd: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """The multiplier of PID control: lambda = clip(I + kp S + kd max(S - S_prev, 0), 0, lambda_max).
+
+    I moves by `dual_update`, whose projection is the anti-windup: it never leaves the multiplier's own interval, so it
+    answers at once when the excess changes sign. A cost that falls adds nothing (Stooke et al., 2020, Algorithm 2).
+
+    Args:
+      integral: I [...]; excess, previous_excess: S [...] of this update and of the last, in the same unit.
+    """
+    change = jnp.maximum(excess - previous_excess, 0.0)
+    return jnp.clip(integral + lambda_kp * excess + lambda_kd * change, 0.0, lambda_max)
+
+
+def respond(
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    constraint: Constraint,
+    rows: PolicyRows,
+    excess: jax.Array,
+    log_ratio: jax.Array,
+    reach: jax.Array,
+) -> Constraint:
+    """One agent's constraint [K] after its policy has changed.
+
+    Args:
+      rows: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
+      reach: [] cost per step, the most that a step of the trust region promised to take off the cost.
+    """
+    if setup.method.constraint == "none":
+        return constraint
+    if setup.method.constraint == "trust_region":
+        lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, now.limit_windup * reach)
+        return dataclasses.replace(constraint, lowered=lowered)
+    surrogate = surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
+    step = excess_in_lambda_unit(setup, hyper, excess + hyper.surrogate_weight * surrogate)
+    if setup.config.lambda_unit == "relative":
+        lowest = LAMBDA_MIN * hyper.lambda_init
+        updated = relative_update(constraint.multiplier, step, hyper.lambda_lr, lowest, hyper.lambda_max)
+    else:
+        updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
+    return dataclasses.replace(constraint, multiplier=updated)
+
+
+def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: jax.Array) -> jax.Array:
+    """The change in cost per step that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
+
+    Args:
+      log_ratio, log_weight: [R], after the update; cost_advantage: [R, K], centred.
+
+    Returns:
+      [K].
+    """
+    return jnp.mean(jnp.exp(log_ratio + log_weight)[:, None] * cost_advantage, axis=0)
+
+
+def dual_update(
+    multiplier: jax.Array,
+    excess: jax.Array,
+    lambda_lr: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """One projected gradient step of the multiplier: lambda <- clip(lambda + alpha x, 0, lambda_max) (Eq. 17).
+
+    Args:
+      multiplier: [...], lambda; excess: [...], measured and expected, x = S + I in cost per step, or `relative_excess`.
+    """
+    return jnp.clip(multiplier + lambda_lr * excess, 0.0, lambda_max)
+
+
+def relative_update(
+    multiplier: jax.Array,
+    excess: jax.Array,
+    lambda_lr: jax.Array | float,
+    lambda_min: jax.Array | float,
+    lambda_max: jax.Array | float,
+) -> jax.Array:
+    """One step in proportion to the multiplier: lambda <- clip(lambda exp(alpha x), lambda_min, lambda_max).
+
+    An exponentiated gradient (Kivinen and Warmuth, 1997). A multiplier doubles in the same time whatever its size, so
+    one rate serves limits whose multipliers differ by a factor of ten. Without the lower bound a long time without
+    costs would take as long to undo, and in the end 0 would never move again.
+
+    Args:
+      multiplier: [...], lambda > 0; excess: [...], x, `relative_excess`.
+    """
+    return jnp.clip(multiplier * jnp.exp(lambda_lr * excess), lambda_min, lambda_max)
+
+
+def metrics(setup: Setup, constraint: Constraint, price: jax.Array, excess: jax.Array) -> Metrics:
+    """What an update reports of it, means over agents and costs."""
+    shown = {"lambda": price.mean(), "cost_excess": excess.mean()}
+    if setup.method.constraint == "trust_region":
+        shown["limit_lowered"] = constraint.lowered.mean()
+    return shown
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The limit of a trust region
+
+
+def lower_limit(lowered: jax.Array, excess: jax.Array, limit_lr: jax.Array | float, most: jax.Array) -> jax.Array:
+    """What a trust region's limit is lowered by: d <- d - eta (J - d) per update, never above d itself.
+
+    A linear model of the cost promises more than a step keeps; what is missing adds up here until it is kept. Where
+    the sum is above `most`, it moves down towards it instead (anti-windup by back-calculation): without that, costs
+    far beyond the limit would add up to more than can act, and delay the reward once the limit is kept.
+
+    Args:
+      lowered: [...] so far, and excess: S [...], in cost per step; most: `limit_windup` times the most that a
+        step promises to take off the cost, in the same unit.
+    """
+    return jnp.maximum(lowered + limit_lr * jnp.minimum(excess, most - lowered), 0.0)

@@ -1,0 +1,56 @@
+"""The critics of reward and of cost: their values, and their fit to the returns (Eq. 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from .maths import running_moments
+from .maths.losses import value_loss
+from .optimise import fit
+from .rollout import flatten_steps
+from .schedules import Schedule
+from .setup import Setup
+from .types import Batch, Critic, Hyper, Metrics, Params
+
+ValueFn = Callable[[Params, jax.Array], jax.Array]
+
+
+def values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array, jax.Array]:
+    """Values of the states and of the true next states [T, B, ...], in the signal's unit."""
+    both = value_fn(critic.net.params, jnp.stack([batch.state, batch.next_state]))
+    value, next_value = running_moments.denormalise(critic.returns, both)
+    return value, next_value
+
+
+def fit_critic(
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    critic: Critic,
+    value_fn: ValueFn,
+    clip: jax.Array | float,
+    rows: tuple[jax.Array, jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[Critic, Metrics]:
+    """Updates the moments of the returns once, then fits the critic to them in the new units.
+
+    Args:
+      clip: half-width of the interval of values, in those units.
+      rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+    """
+    state, old_value, returns = rows
+    moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
+    normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
+
+    def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, old, target = minibatch
+        return value_loss(value_fn(params, state), old, target, clip).mean(), {}
+
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
+    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
+    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
+    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}

@@ -1,0 +1,111 @@
+"""Regret: how much a costly action was meant, learned by a prior network (Eq. 13 and 14), and the ratio's weight."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from .maths.losses import appraisal_loss, cross_entropy, smoothed
+from .optimise import fit
+from .rollout import flatten_steps
+from .schedules import Schedule
+from .setup import Setup
+from .types import Batch, Hyper, Metrics, Params, TrainState
+
+
+def appraise_regret(
+    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState | None, batch: Batch, key: jax.Array
+) -> tuple[TrainState | None, jax.Array, Metrics]:
+    """Learns how deliberate the costly actions were, then weighs every step's ratio by how regret has changed.
+
+    Returns:
+      the networks of all agents, log w [T, B, N] (0 without regret), and metrics: mean regret per action entry on
+      costly steps, what it would be on safe ones were they costly, and the weight w over all rows.
+    """
+    if net is None:
+        return None, jnp.zeros_like(batch.log_prob), {}
+    mask = jnp.asarray(setup.vector.spec.action_mask)
+    state = jnp.broadcast_to(batch.state[:, :, None], (*batch.log_prob.shape, batch.state.shape[-1]))
+    logits = jax.vmap(setup.nets.regret, (0, 2, 2), 2)
+    before = logits(net.params, state, batch.action)
+    target = smoothed(deliberateness((batch.action - batch.mean) / batch.std))
+    costly = (batch.cost.max(-1, keepdims=True) > 0) * mask
+    rows = (state, batch.action, target, jax.nn.sigmoid(before), costly)
+    rows = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), rows)
+
+    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, action, target, old, weight = rows
+        logits = setup.nets.regret(params, state, action)
+        return appraisal_loss(cross_entropy(logits, target), logits, old, weight, hyper.regret_l2), {}
+
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
+    passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.emotion_lr, "max_grad_norm": hyper.max_grad_norm}
+    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, *each[1:], **limits, **passes))(net, rows, keys)
+    # Adam's momentum would move a network that had nothing to learn from.
+    learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
+    after = logits(learned.params, state, batch.action)
+    new, old = regret(after, batch.cost), regret(before, batch.cost)
+    bound = hyper.kappa * hyper.clip
+    if setup.config.regret_response != "letter":  # the other responses answer to regret itself, not to its change
+        old = jnp.zeros_like(new)
+    if setup.config.regret_response == "advantage":  # no ratio is touched, so there is no clip interval to leave
+        bound = hyper.regret_max
+    log_weight = regret_weight(new, old, mask, omega=hyper.omega, regret_max=hyper.regret_max, bound=bound)
+    weight = jnp.exp(log_weight)
+    diagnostics = {
+        "on_costly": (new * mask).sum() / costly.sum(),
+        "on_safe": (jax.nn.sigmoid(after) * (mask - costly)).sum() / (mask - costly).sum(),
+        "weight_mean": weight.mean(),
+        "weight_std": weight.std(),
+    }
+    return learned, log_weight, {**{k: x.mean(0) for k, x in metrics.items()}, **diagnostics}
+
+
+def regret(logits: jax.Array, cost: jax.Array) -> jax.Array:
+    """Regret per action entry, felt only where the step was costly: sigmoid(l) 1[C > 0] (Eq. 13).
+
+    Args:
+      logits: [..., A]; cost: [..., K] in [0, 1]; with several costs any of them will do.
+    """
+    return jax.nn.sigmoid(logits) * (cost.max(-1, keepdims=True) > 0)
+
+
+def deliberateness(z: jax.Array) -> jax.Array:
+    """How much the policy meant an action entry, `z` [...] standard deviations from its mean: the target of regret.
+
+    It is the density relative to the mode, exp(-z^2 / 2). A costly action that was meant is regretted, an accident of
+    exploration is not.
+    """
+    return jnp.exp(-0.5 * z**2)
+
+
+def regret_weight(
+    new: jax.Array,
+    old: jax.Array,
+    mask: jax.Array,
+    *,
+    omega: jax.Array | float,
+    regret_max: jax.Array | float,
+    bound: jax.Array | float,
+) -> jax.Array:
+    """The logarithm of the weight that regret puts on the probability ratio: log prod (1 - r) / (1 - r_old) (Eq. 15).
+
+    Below 0 where regret has risen since the action was taken; exactly 0 where there is none, or it has not changed.
+
+    Args:
+      new, old: [..., A] regret now and when the action was taken; mask: [..., A] 1 for real action entries.
+      omega: the share of entries that count, by the regret now and for both alike: the ceil(omega A) with the most
+        (ties all count).
+      regret_max: regret is cut here, so that a single entry moves the ratio at most tenfold at 0.9.
+      bound: the weight stays within [1 - bound, 1 + bound], so that it alone never leaves the clip interval, which
+        would kill the row's gradient; inf for none.
+
+    Returns:
+      [...]; a constant of the policy's weights.
+    """
+    new, old = jnp.minimum(new, regret_max) * mask, jnp.minimum(old, regret_max) * mask
+    above = jnp.sum((new[..., None, :] > new[..., :, None]) * mask[..., None, :], axis=-1)
+    chosen = above < jnp.ceil(omega * mask.sum(-1, keepdims=True))
+    log_weight = jnp.sum(chosen * (jnp.log1p(-new) - jnp.log1p(-old)), axis=-1)
+    return jnp.clip(log_weight, jnp.log(jnp.maximum(1 - bound, 0.0)), jnp.log1p(bound))
