@@ -115,10 +115,7 @@ def _plain(task: str) -> tuple[Case, ...]:
 def _ruled(task: str, *settings: tuple[str, Any]) -> tuple[Case, ...]:
     pid = (("lambda_kp", 0.5), ("lambda_kd", 0.1))
     rules = {"integral": (), "pid": pid}
-    return tuple(
-        _training(task, "mappo_l", 1, 64, 64, *settings, ("lambda_rule", rule), *gains, what=rule)
-        for rule, gains in rules.items()
-    )
+    return tuple(_training(task, "mappo_l", 1, 64, 64, *settings, *gains, what=rule) for rule, gains in rules.items())
 
 
 def _in_jobs(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:

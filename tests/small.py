@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pmt_jax import load_config, make_setup
 from pmt_jax.config.settings import HYPER_FIELDS, Hyper
@@ -56,10 +57,18 @@ def acted() -> tuple[Setup, LearnerState, Batch]:
     made = program("r4sg")
     start = made.init(made.setup.hyper, jax.random.key(0))
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
-    state, batch = jax.jit(functools.partial(learner._act, made.setup))(made.setup.hyper, start, tagged)
+    state, batch = jax.jit(functools.partial(learner.act, made.setup))(made.setup.hyper, start, tagged)
     return made.setup, state, batch
 
 
 def weights(state: LearnerState) -> dict[str, Any]:
     """What methods that are equal agree in."""
-    return {"actor": state.actor.params, "critic": state.critic.net.params, "lambda": state.multiplier}
+    return {"actor": state.actor.params, "critic": state.critic.net.params, "lambda": state.constraint.multiplier}
+
+
+def differ(a: Any, b: Any, by: float = 1e-4) -> bool:
+    """Whether two pytrees of the same structure are finite and not the same, by more than rounding."""
+    pairs = list(zip(*(map(np.asarray, jax.tree.leaves(tree)) for tree in (a, b)), strict=True))
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    assert all(np.isfinite(x).all() for pair in pairs for x in pair)
+    return any(np.abs(x - y).max(initial=0.0) > by for x, y in pairs)

@@ -225,7 +225,7 @@ def _mean_std(*mean_and_std: float | None) -> str:
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     """Whether a run's multiplier follows PID; the setting is there for methods without one, too."""
-    return METHODS[method].constraint == "lagrangian" and settings.get("lambda_rule") == "pid"
+    return METHODS[method].constraint == "lagrangian" and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
 
 
 def _row(run: Run) -> Row:

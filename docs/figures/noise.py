@@ -30,7 +30,7 @@ import numpy as np
 from bench import records
 from pmt_jax import init, load_config, make_setup, tasks, train_step
 from pmt_jax.config.settings import Hyper
-from pmt_jax.learning import emotions, learner
+from pmt_jax.learning import critics, fear, learner, schedules
 from pmt_jax.learning.maths.advantages import gae
 from pmt_jax.learning.rollout import flatten_steps
 from pmt_jax.learning.setup import Setup
@@ -53,9 +53,9 @@ def advantages(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[jax.Arr
       VALUES: the critic's values, or 0 in their place. The one before it is SIGNALS. Last, the true cost per step [].
     """
     key = jax.random.fold_in(state.key, state.update)
-    hyper = learner._annealed(setup, hyper, state.update)
-    state, batch = learner._act(setup, hyper, state, {tag: jax.random.fold_in(key, tag) for tag in Tag})
-    values = learner._values(state.cost_critic, setup.nets.cost_value, batch)
+    now = schedules.at(setup.config, hyper, state.update)
+    state, batch = learner.act(setup, hyper, state, {tag: jax.random.fold_in(key, tag) for tag in Tag})
+    values = critics.values(state.cost_critic, setup.nets.cost_value, batch)
     zeros = (jnp.zeros_like(batch.cost), jnp.zeros_like(batch.cost))
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
 
@@ -65,8 +65,8 @@ def advantages(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[jax.Arr
     def thinned(key: jax.Array) -> jax.Array:
         felt = tasks.felt_cost(flatten_steps(batch.true_cost), key, hyper.cost_seen, 0.0).reshape(batch.cost.shape)
         seen = dataclasses.replace(batch, cost=felt)
-        _, fear, _ = emotions.appraise_fear(setup, hyper, state.fear, seen, jax.random.fold_in(key, Tag.FEAR))
-        return jnp.stack([both(felt), both(fear)])
+        _, feared, _ = fear.appraise_fear(setup, hyper, now, state.fear, seen, jax.random.fold_in(key, Tag.FEAR))
+        return jnp.stack([both(felt), both(feared)])
 
     drawn = jax.lax.map(thinned, jax.random.split(jax.random.fold_in(key, THINNED), THINNINGS))
     return both(hyper.cost_seen * batch.true_cost), drawn, batch.true_cost.mean()

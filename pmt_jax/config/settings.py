@@ -143,12 +143,12 @@ class Hyper:
     )
     lambda_kp: float = constraint(
         0.0,
-        "with lambda_rule = pid: weight of the excess, in `lambda_unit`, that is added to the multiplier",
+        "PID: weight of the excess, in `lambda_unit`, that is added to the multiplier; 0 for the integral alone",
         NOT_NEGATIVE,
     )
     lambda_kd: float = constraint(
         0.0,
-        "with lambda_rule = pid: weight of its rise since the last update, added as well",
+        "PID: weight of the excess's rise since the last update, added as well",
         NOT_NEGATIVE,
     )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
@@ -181,7 +181,7 @@ class Hyper:
     temperature: float = emotion(0.5, "temperature of the relaxed samples of the gumbel fear losses", POSITIVE)
     omega: float = emotion(
         0.5,
-        "regret_mask = top: the share of an action's entries that count; threshold: the least regret that counts",
+        "share of an action's entries that count, those with the most regret",
         NOT_NEGATIVE_OR_INF,
     )
     regret_max: float = emotion(
@@ -265,28 +265,11 @@ class Config(Hyper):
         "changes in proportion to itself, so that it becomes large soon where a tight limit needs it, down to a "
         "hundredth of `lambda_init`",
     )
-    lambda_rule: Literal["integral", "pid"] = constraint(
-        "integral",
-        "integral: the multiplier sums the excesses times lambda_lr; pid: lambda_kp times the current excess and "
-        "lambda_kd times its rise are added (PID-Lagrangian)",
-    )
-    cost_advantage: Literal["std", "center"] = constraint(
-        "std", "cost advantages in the policy's loss are standardised (with a floor) or only centred"
-    )
     fear_time: Literal["next", "current"] = emotion(
         "next", "fear of the state to which an action leads, or of the state in which it is taken"
     )
     fear_loss: Literal["ce", "gumbel_fwd", "gumbel_rev"] = emotion(
         "ce", "cross entropy, or relaxed samples with the divergence from the observed cost forward or reversed"
-    )
-    fear_history: Literal["rollout", "random"] = emotion(
-        "rollout", "earlier fear that the change of fear is measured from: of the same state or of a random one"
-    )
-    regret_mask: Literal["top", "threshold", "none"] = emotion(
-        "top", "action entries that count: the share omega with the most regret, those of at least omega, or all"
-    )
-    regret_target: Literal["mode", "tail"] = emotion(
-        "mode", "how deliberate an action was: density relative to the mode, or tail probability"
     )
     regret_response: Literal["letter", "one_sided", "advantage"] = emotion(
         "letter",

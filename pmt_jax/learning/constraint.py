@@ -40,8 +40,10 @@ def target(hyper: Hyper) -> jax.Array:
 # Estimate and excess
 
 
-def estimate_cost(setup: Setup, hyper: Hyper, previous: jax.Array, batch: Batch, cost_value: jax.Array) -> jax.Array:
-    """The undiscounted cost per episode [N, K] that the constraint is held against (`cost_estimate`).
+def estimate_cost(
+    how: str, horizon: int, batch: Batch, previous: jax.Array, cost_value: jax.Array, gamma: jax.Array | float
+) -> jax.Array:
+    """The undiscounted cost per episode [N, K] that the constraint is held against.
 
     `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
     times the horizon; no lag, for batches much shorter than an episode. `average`: the rate's moving average, in which
@@ -50,18 +52,18 @@ def estimate_cost(setup: Setup, hyper: Hyper, previous: jax.Array, batch: Batch,
     mean cost value, times the horizon.
 
     Args:
-      previous: [N, K], the estimate before; cost_value: [T, B, N, K] of the batch's states.
+      how: `cost_estimate`; horizon: in steps; previous: [N, K], the estimate before.
+      cost_value: [T, B, N, K] of the batch's states, discounted by gamma.
     """
-    horizon = setup.vector.horizon
     rate = horizon * batch.cost.mean((0, 1))
-    match setup.config.cost_estimate:
+    match how:
         case "critic":
-            return (1 - hyper.gamma) * horizon * cost_value.mean((0, 1))
+            return (1 - gamma) * horizon * cost_value.mean((0, 1))
         case "rate":
             return rate
         case "average":
             return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
-        case "episode":
+        case _:
             return jnp.where(batch.finished.any(), finished_mean(batch, batch.episode_cost), previous)
 
 

@@ -112,8 +112,11 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.
     held = state.constraint
-    estimate = constraint.estimate_cost(setup, hyper, held.estimate, batch, cost_value)
-    excess = constraint.cost_excess(estimate, constraint.target(hyper), setup.vector.horizon)
+    horizon = setup.vector.horizon
+    estimate = constraint.estimate_cost(
+        setup.config.cost_estimate, horizon, batch, held.estimate, cost_value, hyper.gamma
+    )
+    excess = constraint.cost_excess(estimate, constraint.target(hyper), horizon)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=held.estimate)
     actor_rows = policy_rows(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
 
@@ -137,7 +140,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch),
-        **rollout.limits_kept(batch, hyper, setup.vector.horizon),
+        **rollout.limits_kept(batch, hyper, horizon),
         **constraint.metrics(setup, held, price(held.multiplier), excess),
         **_named("critic", critic_metrics),
         **_named("cost_critic", cost_critic_metrics),

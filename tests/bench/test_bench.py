@@ -446,7 +446,7 @@ def test_only_a_multiplier_is_called_pid(tmp_path: pathlib.Path):
     """The setting is in the configuration of every method, also where nothing reads it."""
     made = []
     for method in ("mappo", "macpo", "f4sg"):
-        run = fake_run(tmp_path / method, lambda_rule='"pid"')
+        run = fake_run(tmp_path / method, lambda_kp=0.5)
         for file in (run / "config.toml", run / "metrics.jsonl"):
             file.write_text(file.read_text().replace("happo", method))
         made.append(run)
@@ -459,7 +459,7 @@ def test_an_overview_has_multipliers_with_pid_only(tmp_path: pathlib.Path):
     """And "-" where a method of another task is missing."""
     for task, methods in {"lane": ("mappo", "f4sg", "mixed"), "switch": ("mappo", "f4sg")}.items():
         for method in methods:
-            run = fake_run(tmp_path / task / method, lambda_rule='"integral"' if method == "mixed" else '"pid"')
+            run = fake_run(tmp_path / task / method, lambda_kp=0.0 if method == "mixed" else 0.5)
             for file in (run / "config.toml", run / "metrics.jsonl"):
                 file.write_text(file.read_text().replace("happo", method).replace("lane", task))
         runs.store([tmp_path / task], tmp_path / f"{task}.json")

@@ -13,33 +13,30 @@ import optax
 import pytest
 
 import pmt_jax
-from pmt_jax.learning import emotions
-from pmt_jax.learning.emotions import regret_weight
-
-TOP = {"choose": "top", "regret_max": 0.9}
+from pmt_jax.learning import fear, regret
+from pmt_jax.learning.maths import losses
 
 
 def test_bernoulli_divergence():
-    np.testing.assert_allclose(emotions.bernoulli_kl(jnp.asarray(0.5), jnp.asarray(0.25)), 0.143841, rtol=1e-5)
-    np.testing.assert_allclose(emotions.bernoulli_kl(jnp.asarray(0.25), jnp.asarray(0.5)), 0.130812, rtol=1e-5)
-    assert np.isfinite(emotions.bernoulli_kl(jnp.asarray(1.0), jnp.asarray(0.0)))
+    np.testing.assert_allclose(losses.bernoulli_kl(jnp.asarray(0.5), jnp.asarray(0.25)), 0.143841, rtol=1e-5)
+    np.testing.assert_allclose(losses.bernoulli_kl(jnp.asarray(0.25), jnp.asarray(0.5)), 0.130812, rtol=1e-5)
+    assert np.isfinite(losses.bernoulli_kl(jnp.asarray(1.0), jnp.asarray(0.0)))
 
 
 def test_deliberateness():
     z = jnp.asarray([0.0, 1.0, 2.0])
-    np.testing.assert_allclose(emotions.deliberateness(z, "mode"), [1, 0.606531, 0.135335], rtol=1e-5)
-    np.testing.assert_allclose(emotions.deliberateness(z, "tail"), [1, 0.317311, 0.045500], rtol=1e-4)
+    np.testing.assert_allclose(regret.deliberateness(z), [1, 0.606531, 0.135335], rtol=1e-5)
 
 
 def test_mean_of_a_relaxed_sample():
     noise = jax.random.logistic(jax.random.key(0), (400_000,))
-    np.testing.assert_allclose(emotions.relaxed_bernoulli(jnp.asarray(1.3), noise, 1.0).mean(), 0.705158, atol=2e-3)
+    np.testing.assert_allclose(fear.relaxed_bernoulli(jnp.asarray(1.3), noise, 1.0).mean(), 0.705158, atol=2e-3)
 
 
 def weigh(new: list[float], old: list[float], omega: float = 2 / 3, bound: float = jnp.inf, **changes) -> jax.Array:
     mask = jnp.ones(len(new))
-    options = {**TOP, "omega": omega, "bound": bound, **changes}
-    return regret_weight(jnp.asarray(new), jnp.asarray(old), mask, **options)
+    options = {"regret_max": 0.9, "omega": omega, "bound": bound, **changes}
+    return regret.regret_weight(jnp.asarray(new), jnp.asarray(old), mask, **options)
 
 
 def test_regret_weight():
@@ -59,29 +56,27 @@ def test_regret_masks():
     logs = np.log1p(-np.asarray(new))
     np.testing.assert_allclose(weigh(new, old, omega=1 / 3), logs[0], rtol=1e-5)
     np.testing.assert_allclose(weigh(new, old, omega=2 / 3), logs.sum(), rtol=1e-5)  # ties all count
-    np.testing.assert_allclose(weigh(new, old, omega=0.3, choose="threshold"), logs[0], rtol=1e-5)
-    np.testing.assert_allclose(weigh(new, old, choose="none"), logs.sum(), rtol=1e-5)
     np.testing.assert_allclose(weigh([1.0], [0.0], omega=1.0), np.log(0.1), rtol=1e-5)
 
 
 def test_padded_actions_have_no_regret():
     mask = jnp.asarray([1.0, 1.0, 0.0])
-    with_padding = regret_weight(
-        jnp.asarray([0.1, 0.2, 0.8]), jnp.zeros(3), mask, choose="top", omega=0.5, regret_max=0.9, bound=jnp.inf
+    with_padding = regret.regret_weight(
+        jnp.asarray([0.1, 0.2, 0.8]), jnp.zeros(3), mask, omega=0.5, regret_max=0.9, bound=jnp.inf
     )
     np.testing.assert_allclose(with_padding, np.log(0.8), rtol=1e-5)
 
 
 def test_regret_is_felt_only_where_it_cost():
     logits, cost = jnp.asarray([[2.0, -1.0], [2.0, -1.0]]), jnp.asarray([[1.0], [0.0]])
-    felt = emotions.regret(logits, cost)
+    felt = regret.regret(logits, cost)
     np.testing.assert_allclose(felt[0], jax.nn.sigmoid(logits[0]))
     np.testing.assert_array_equal(felt[1], 0)
 
 
 def test_calibration():
     p, y = jnp.asarray([0.05, 0.05, 0.95, 0.95]), jnp.asarray([0.0, 0.0, 1.0, 0.0])
-    figures = emotions.calibration(p, y)
+    figures = fear.calibration(p, y)
     np.testing.assert_allclose(figures["brier"], (2 * 0.05**2 + 0.05**2 + 0.95**2) / 4, rtol=1e-5)
     np.testing.assert_allclose(figures["ece"], (0.1 + 0.9) / 4, rtol=1e-5)
     np.testing.assert_allclose(figures["on_costly"], 0.95, rtol=1e-6)
@@ -104,9 +99,9 @@ def tabular(loss: str, l2: float = 0.0, steps: int = 300, remembered: str = "sel
     def objective(logits: jax.Array, key: jax.Array) -> jax.Array:
         mine = logits[state]
         noise = jax.random.logistic(key, mine.shape)
-        distance = emotions.divergence(mine, cost, loss, noise, 0.5)  # pyright: ignore
+        distance = fear.divergence(mine, cost, loss, noise, 0.5)  # pyright: ignore
         old = jax.lax.stop_gradient(jax.nn.sigmoid(mine)) if remembered == "self" else jnp.zeros_like(mine)
-        return emotions.appraisal_loss(distance, mine, old, jnp.ones_like(mine), l2)
+        return losses.appraisal_loss(distance, mine, old, jnp.ones_like(mine), l2)
 
     def step(carry, key):
         logits, opt = carry
@@ -145,8 +140,8 @@ def test_without_weight_there_is_no_loss_and_no_gradient():
     logits, target = jnp.asarray([0.3, -2.0]), jnp.asarray([0.9, 0.1])
 
     def objective(logits: jax.Array) -> jax.Array:
-        distance = emotions.divergence(logits, target, "ce", jnp.zeros(2), 1.0)
-        return emotions.appraisal_loss(distance, logits, jnp.zeros(2), jnp.zeros(2), 1.0)
+        distance = losses.cross_entropy(logits, target)
+        return losses.appraisal_loss(distance, logits, jnp.zeros(2), jnp.zeros(2), 1.0)
 
     assert objective(logits) == 0
     np.testing.assert_array_equal(jax.grad(objective)(logits), 0)
@@ -159,21 +154,21 @@ def test_regret_learns_how_deliberate_a_costly_action_was():
     from pmt_jax.learning.optimise import fit, init_train_state
 
     action = jax.random.normal(jax.random.key(0), (8192, 1))
-    target = emotions.deliberateness(action, "mode")
+    target = regret.deliberateness(action)
     net = nn.Sequential([nn.Dense(32), nn.tanh, nn.Dense(32), nn.tanh, nn.Dense(1)])
 
     def loss(params, rows):
         x, p = rows
         logits: jax.Array = net.apply(params, x)  # pyright: ignore
-        distance = emotions.divergence(logits, p, "ce", jnp.zeros_like(p), 1.0)
-        return emotions.appraisal_loss(distance, logits, p, jnp.ones_like(p), 0.0), {}
+        distance = losses.cross_entropy(logits, p)
+        return losses.appraisal_loss(distance, logits, p, jnp.ones_like(p), 0.0), {}
 
     start = init_train_state(net.init(jax.random.key(1), action[:1]))
     options = {"learning_rate": 5e-3, "max_grad_norm": 10.0, "epochs": 60, "minibatches": 8}
     trained, _ = fit(start, loss, (action, target), jax.random.key(2), **options)
     probe = jnp.linspace(-2, 2, 41)[:, None]
-    regret = jax.nn.sigmoid(net.apply(trained.params, probe))  # pyright: ignore
-    np.testing.assert_allclose(regret, jnp.exp(-0.5 * probe**2), atol=0.05)
+    learned = jax.nn.sigmoid(net.apply(trained.params, probe))  # pyright: ignore
+    np.testing.assert_allclose(learned, jnp.exp(-0.5 * probe**2), atol=0.05)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

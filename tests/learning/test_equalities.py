@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 
 from pmt_jax import METHODS
-from pmt_jax.learning import emotions, policy_update
-from pmt_jax.learning.types import Tag
-from small import acted, program, trained, weights
+from pmt_jax.learning import fear, policies, regret, schedules
+from pmt_jax.learning.types import LearnerState, Tag
+from small import acted, differ, program, trained, weights
+
+
+def holding(state: LearnerState, **changes: jax.Array) -> LearnerState:
+    """`state` with parts of its constraint changed."""
+    return dataclasses.replace(state, constraint=dataclasses.replace(state.constraint, **changes))
 
 
 @pytest.mark.full
@@ -25,28 +30,23 @@ def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
 
 @pytest.mark.full
 def test_a_multiplier_that_acts_makes_a_difference():
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_equal(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
-
-
-def test_pid_without_its_gains_is_the_integral():
-    chex.assert_trees_all_equal(trained("mappo_l", lambda_rule="pid"), trained("mappo_l"))
+    assert differ(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
 def test_pid_weighs_costs_by_three_terms():
     """A proportional gain weighs costs as a larger multiplier does, from the first update on."""
-    pid, plain = program("mappo_l", lambda_rule="pid"), program("mappo_l")
+    plain = program("mappo_l")
     start = plain.init(plain.setup.hyper, jax.random.key(0))
     _, metrics = plain.step(plain.setup.hyper, start)
     excess = metrics["cost_excess"]  # the same of both agents; the estimate before the first update is the limit
-    with_gains, shown = pid.step(pid.hyper(lambda_kp=0.5, lambda_kd=0.25), start)
-    larger, _ = plain.step(plain.setup.hyper, dataclasses.replace(start, multiplier=start.multiplier + 0.75 * excess))
+    with_gains, shown = plain.step(plain.hyper(lambda_kp=0.5, lambda_kd=0.25), start)
+    larger, _ = plain.step(plain.setup.hyper, holding(start, multiplier=start.constraint.multiplier + 0.75 * excess))
     chex.assert_trees_all_close(with_gains.actor.params, larger.actor.params, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(shown["lambda"], with_gains.multiplier.mean() + 0.75 * excess, rtol=1e-5)
-    _, later = pid.step(pid.hyper(lambda_kd=0.25), with_gains)
+    np.testing.assert_allclose(shown["lambda"], with_gains.constraint.multiplier.mean() + 0.75 * excess, rtol=1e-5)
+    _, later = plain.step(plain.hyper(lambda_kd=0.25), with_gains)
     rise = max(float(later["cost_excess"] - excess), 0.0)
     np.testing.assert_allclose(
-        later["lambda"], pid.step(pid.hyper(), with_gains)[0].multiplier.mean() + 0.25 * rise, rtol=1e-2
+        later["lambda"], plain.step(plain.hyper(), with_gains)[0].constraint.multiplier.mean() + 0.25 * rise, rtol=1e-2
     )
 
 
@@ -64,11 +64,11 @@ def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
 def test_macpo_keeps_to_the_limit_that_it_lowered():
     made = program("macpo")
     horizon, start = made.setup.vector.horizon, made.init(made.setup.hyper, jax.random.key(0))
-    lowered = dataclasses.replace(start, multiplier=jnp.full_like(start.multiplier, 2.0 / horizon))
+    lowered = holding(start, lowered=jnp.full_like(start.constraint.lowered, 2.0 / horizon))
     after, metrics = made.step(made.hyper(cost_limit=12.0, limit_lr=0.25), lowered)
     lower, _ = made.step(made.hyper(cost_limit=10.0), start)
     chex.assert_trees_all_close(after.actor.params, lower.actor.params, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(after.multiplier, 2.0 / horizon + 0.25 * metrics["cost_excess"], rtol=1e-5)
+    np.testing.assert_allclose(after.constraint.lowered, 2.0 / horizon + 0.25 * metrics["cost_excess"], rtol=1e-5)
 
 
 @pytest.mark.full
@@ -76,11 +76,11 @@ def test_macpo_lowers_its_limit_by_no_more_than_limit_windup_allows():
     made = program("macpo")
     start = made.init(made.setup.hyper, jax.random.key(0))
     # After two half-lives of the trust region a step reaches half as far as the first did.
-    far = dataclasses.replace(start, multiplier=jnp.ones_like(start.multiplier), update=jnp.int32(2))
+    far = holding(dataclasses.replace(start, update=jnp.int32(2)), lowered=jnp.ones_like(start.constraint.lowered))
     for windup, counted in (1.0, 1.0), (1.5, 1.5), (math.inf, 2.0):
         hyper = made.hyper(limit_lr=1.0, limit_windup=windup, kl_half_life=made.setup.config.batch_size)
         after, metrics = made.step(hyper, far)  # all the way: a limit_lr of 1
-        np.testing.assert_allclose(after.multiplier.mean(), counted * metrics["actor/reach"], rtol=1e-5)
+        np.testing.assert_allclose(after.constraint.lowered.mean(), counted * metrics["actor/reach"], rtol=1e-5)
 
 
 @pytest.mark.full
@@ -93,8 +93,7 @@ def test_macpos_steps_halve_in_actor_lr_half_life():
     second, _ = made.step(shorter, first)
     quarter = made.hyper(kl_limit=made.setup.hyper.kl_limit / 4)  # a step's divergence is the square of its length
     chex.assert_trees_all_equal(second, made.step(quarter, first)[0])
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_equal(second.actor, made.step(made.setup.hyper, first)[0].actor)
+    assert differ(second.actor, made.step(made.setup.hyper, first)[0].actor)
 
 
 @pytest.mark.full
@@ -105,7 +104,7 @@ def test_a_multiplier_in_units_of_the_limit_climbs_alike_below_every_limit():
             made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
             made.init(made.setup.hyper, jax.random.key(0)),
         )
-        np.testing.assert_allclose(after.multiplier, 0.78 + 0.25, rtol=1e-6)
+        np.testing.assert_allclose(after.constraint.multiplier, 0.78 + 0.25, rtol=1e-6)
 
 
 @pytest.mark.full
@@ -116,7 +115,7 @@ def test_a_relative_multiplier_grows_by_the_same_share_below_every_limit():
             made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
             made.init(made.setup.hyper, jax.random.key(0)),
         )
-        np.testing.assert_allclose(after.multiplier, 0.78 * np.exp(0.25), rtol=1e-6)
+        np.testing.assert_allclose(after.constraint.multiplier, 0.78 * np.exp(0.25), rtol=1e-6)
 
 
 @pytest.mark.full
@@ -134,7 +133,7 @@ def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without:
 
 
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(emotions, "appraise_fear", lambda setup, hyper, net, batch, key: (net, batch.cost, {}))
+    monkeypatch.setattr(fear, "appraise_fear", lambda setup, hyper, now, net, batch, key: (net, batch.cost, {}))
     made = program.__wrapped__("f4sg")
     state = made.init(made.setup.hyper, jax.random.key(0))
     for _ in range(3):
@@ -154,8 +153,7 @@ def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
     without, plain = updated("macpo_regret", regret_max=0.0), updated("macpo")
     chex.assert_trees_all_equal(without, updated("macpo_regret", kappa=0.0))
     chex.assert_trees_all_close(without, plain, rtol=1e-2, atol=2e-4)
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_close(updated("macpo_regret"), plain, rtol=1e-2, atol=2e-4)
+    assert differ(updated("macpo_regret"), plain)
 
 
 @pytest.mark.full
@@ -164,14 +162,14 @@ def test_other_responses_to_regret_act_and_vanish_with_it(response: str):
     plain = weights(trained("mappo_l")[0])
     without, _ = trained("r4sg", regret_response=response, regret_max=0.0)
     chex.assert_trees_all_close(weights(without), plain, rtol=1e-4, atol=1e-5)
-    with pytest.raises(AssertionError):
-        chex.assert_trees_all_close(weights(trained("r4sg", regret_response=response)[0]), plain, rtol=1e-4)
+    assert differ(weights(trained("r4sg", regret_response=response)[0]), plain)
 
 
 def test_regret_stands_still_where_nothing_ever_costs():
     setup, state, batch = acted()
+    now = schedules.at(setup.config, setup.hyper, jnp.int32(0))
     harmless = dataclasses.replace(batch, cost=jnp.zeros_like(batch.cost))
-    appraise = jax.jit(lambda batch: emotions.appraise_regret(setup, setup.hyper, state.regret, batch, state.key))
+    appraise = jax.jit(lambda batch: regret.appraise_regret(setup, setup.hyper, now, state.regret, batch, state.key))
     net, log_weight, _ = appraise(harmless)
     chex.assert_trees_all_equal(net, state.regret)
     assert not log_weight.any()
@@ -185,26 +183,27 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     hyper = setup.hyper
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
-    rows = policy_update.policy_rows(
-        setup, hyper, state.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
+    now = schedules.at(setup.config, hyper, state.update)
+    rows = policies.policy_rows(
+        setup, hyper, state.constraint.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
-    cost_excess = jnp.asarray([[0.5], [0.25]])
-    actor, multiplier, _ = policy_update._sequential(
-        setup, hyper, state.actor, state.multiplier, rows, cost_excess, tagged
+    excess = jnp.asarray([[0.5], [0.25]])
+    actor, constraint, _ = policies.update_policies(
+        setup, hyper, now, state.actor, state.constraint, rows, excess, tagged
     )
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)
-    update = jax.jit(lambda *each: policy_update.update_policy(setup, hyper, *each))
+    update = jax.jit(lambda *each: policies.update_policy(setup, hyper, now, *each))
     for i in np.asarray(jax.random.permutation(tagged[Tag.ORDER], 2)):
-        mine = dataclasses.replace(policy_update._select_agent(rows, i), factor=factor)
-        before, key = policy_update._select_agent(state.actor, i), jax.random.fold_in(tagged[Tag.ACTOR], i)
-        net, _ = update(before, mine, cost_excess[i], key)
-        chex.assert_trees_all_close(net.params, policy_update._select_agent(actor.params, i), rtol=1e-5, atol=1e-6)
-        log_ratio = policy_update._policy_change(setup, net.params, mine)[0]
+        mine = dataclasses.replace(policies.select_agent(rows, i), factor=factor)
+        before, key = policies.select_agent(state.actor, i), jax.random.fold_in(tagged[Tag.ACTOR], i)
+        net, _, _ = update(before, mine, excess[i], key)
+        chex.assert_trees_all_close(net.params, policies.select_agent(actor.params, i), rtol=1e-5, atol=1e-6)
+        log_ratio, _ = policies.policy_change(setup, net.params, mine)
         surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
-        expected = 0.78 + hyper.lambda_lr * (cost_excess[i, 0] + surrogate)
-        np.testing.assert_allclose(multiplier[i, 0], expected, rtol=1e-5)
+        expected = 0.78 + hyper.lambda_lr * (excess[i, 0] + surrogate)
+        np.testing.assert_allclose(constraint.multiplier[i, 0], expected, rtol=1e-5)
         factor, total = factor * jnp.exp(log_ratio), total + log_ratio
     np.testing.assert_allclose(factor, jnp.exp(total), rtol=1e-5)
     assert jnp.abs(factor - 1).max() > 1e-3

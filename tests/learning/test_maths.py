@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pmt_jax.learning.maths import distributions, lagrangian, running_moments
+from pmt_jax.learning import constraint
+from pmt_jax.learning.maths import distributions, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
 from pmt_jax.learning.maths.losses import clipped_surrogate, huber, hybrid_advantage, value_loss
 from pmt_jax.learning.networks import LayerNorm
@@ -155,39 +156,39 @@ def test_hybrid_advantage():
 @pytest.mark.parametrize(("cost_advantage", "expected"), [([0.5, -0.25], 0.805), ([0.5, 0.25], 0.855)])
 def test_dual_update(cost_advantage: list[float], expected: float):
     surrogate = jnp.mean(jnp.asarray([1.0, 2.0]) * jnp.asarray(cost_advantage))
-    violation = lagrangian.cost_excess(jnp.asarray(30.0), 5.0, 100)
+    violation = constraint.cost_excess(jnp.asarray(30.0), 5.0, 100)
     np.testing.assert_allclose(
-        lagrangian.dual_update(jnp.asarray(0.78), violation + surrogate, 0.1, 20.0), expected, rtol=1e-6
+        constraint.dual_update(jnp.asarray(0.78), violation + surrogate, 0.1, 20.0), expected, rtol=1e-6
     )
 
 
 def test_dual_update_is_projected():
-    violation = lagrangian.cost_excess(jnp.asarray(0.0), 50.0, 100)
-    assert lagrangian.dual_update(jnp.asarray(0.78), violation, 2.0, 20.0) == 0
-    assert lagrangian.dual_update(jnp.asarray(19.9), -violation, 2.0, 20.0) == 20
+    violation = constraint.cost_excess(jnp.asarray(0.0), 50.0, 100)
+    assert constraint.dual_update(jnp.asarray(0.78), violation, 2.0, 20.0) == 0
+    assert constraint.dual_update(jnp.asarray(19.9), -violation, 2.0, 20.0) == 20
 
 
 def test_a_relative_update_is_a_share_of_the_multiplier_within_its_bounds():
     multiplier = jnp.asarray([0.5, 4.0])
-    up, down = (lagrangian.relative_update(multiplier, jnp.asarray(x), 0.25, 0.01, 20.0) for x in (1.0, -1.0))
+    up, down = (constraint.relative_update(multiplier, jnp.asarray(x), 0.25, 0.01, 20.0) for x in (1.0, -1.0))
     np.testing.assert_allclose(up / multiplier, np.exp(0.25), rtol=1e-6)
     np.testing.assert_allclose(up * down, multiplier**2, rtol=1e-6)  # as fast down as up
     for near, excess, bound in (19.9, 1.0, 20.0), (0.0101, -1.0, 0.01):
-        bounded = lagrangian.relative_update(jnp.asarray(near), jnp.asarray(excess), 0.25, 0.01, 20.0)
+        bounded = constraint.relative_update(jnp.asarray(near), jnp.asarray(excess), 0.25, 0.01, 20.0)
         np.testing.assert_allclose(bounded, bound, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("cost", "share"), [(0, -1), (1.5, -0.25), (2, 0), (3, 0.5), (4, 1), (90, 1)])
 def test_an_excess_as_a_share_of_the_limit(cost: float, share: float):
     for scale in 1.0, 0.125:
-        excess = lagrangian.cost_excess(jnp.asarray(cost * scale), 2.0 * scale, 50)
-        np.testing.assert_allclose(lagrangian.in_limits(excess, 2.0 * scale, 50), share, rtol=1e-6)
-    assert lagrangian.in_limits(jnp.asarray([0.0, 0.5]), 0.0, 50).tolist() == [0, 1]  # nothing at all is allowed
+        excess = constraint.cost_excess(jnp.asarray(cost * scale), 2.0 * scale, 50)
+        np.testing.assert_allclose(constraint.relative_excess(excess, 2.0 * scale, 50), share, rtol=1e-6)
+    assert constraint.relative_excess(jnp.asarray([0.0, 0.5]), 0.0, 50).tolist() == [0, 1]  # nothing at all is allowed
 
 
 def test_a_limit_is_lowered_by_what_was_not_kept():
     excess = jnp.asarray([2.0, -2.0, -9.0])
-    assert lagrangian.lowered_limit(jnp.asarray(0.5), excess, 0.125, jnp.asarray(99.0)).tolist() == [0.75, 0.25, 0]
+    assert constraint.lower_limit(jnp.asarray(0.5), excess, 0.125, jnp.asarray(99.0)).tolist() == [0.75, 0.25, 0]
 
 
 @pytest.mark.parametrize("excess", [2.0, 0.25])
@@ -196,20 +197,20 @@ def test_a_limit_that_was_lowered_too_far_returns_to_what_a_step_can_reach(exces
     for start in 0.0, 40.0:
         lowered = jnp.asarray(start)
         for _ in range(400):
-            lowered = lagrangian.lowered_limit(lowered, jnp.asarray(excess), 0.1, jnp.asarray(3.0))
+            lowered = constraint.lower_limit(lowered, jnp.asarray(excess), 0.1, jnp.asarray(3.0))
         np.testing.assert_allclose(lowered, 3.0, rtol=1e-5)
-    once = lagrangian.lowered_limit(jnp.asarray(40.0), jnp.asarray(excess), 0.125, jnp.asarray(3.0))
+    once = constraint.lower_limit(jnp.asarray(40.0), jnp.asarray(excess), 0.125, jnp.asarray(3.0))
     assert once == 40.0 - 0.125 * (40.0 - 3.0)
 
 
 def test_pid_adds_what_the_excess_is_and_how_it_rises():
     integral, risen, fallen = jnp.asarray(0.75), (jnp.asarray(0.5), 0.25), (jnp.asarray(-0.25), 0.5)
-    assert lagrangian.pid(integral, *risen, 0.0, 0.0, 20.0) == 0.75
-    assert lagrangian.pid(integral, *risen, 2.0, 0.0, 20.0) == 0.75 + 2 * 0.5
-    assert lagrangian.pid(integral, *risen, 0.0, 4.0, 20.0) == 0.75 + 4 * 0.25
-    assert lagrangian.pid(integral, *fallen, 2.0, 4.0, 20.0) == 0.75 - 2 * 0.25  # a cost that falls adds nothing
-    assert lagrangian.pid(integral, *fallen, 4.0, 0.0, 20.0) == 0
-    assert lagrangian.pid(integral, *risen, 99.0, 0.0, 20.0) == 20
+    assert constraint.pid(integral, *risen, 0.0, 0.0, 20.0) == 0.75
+    assert constraint.pid(integral, *risen, 2.0, 0.0, 20.0) == 0.75 + 2 * 0.5
+    assert constraint.pid(integral, *risen, 0.0, 4.0, 20.0) == 0.75 + 4 * 0.25
+    assert constraint.pid(integral, *fallen, 2.0, 4.0, 20.0) == 0.75 - 2 * 0.25  # a cost that falls adds nothing
+    assert constraint.pid(integral, *fallen, 4.0, 0.0, 20.0) == 0
+    assert constraint.pid(integral, *risen, 99.0, 0.0, 20.0) == 20
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -217,9 +218,9 @@ def test_pid_does_not_wind_up(sign: int):
     """However long the excess lasted, one update of the other sign takes the multiplier off its bound."""
     excess, integral = jnp.asarray(0.5 * sign), jnp.asarray(1.0)
     for _ in range(1000):
-        integral = lagrangian.dual_update(integral, excess, 0.25, 2.0)
-    after = lagrangian.dual_update(integral, -excess, 0.25, 2.0)
-    assert lagrangian.pid(after, -excess, excess, 1.0, 0.0, 2.0) == (2 - 0.125 - 0.5 if sign > 0 else 0.125 + 0.5)
+        integral = constraint.dual_update(integral, excess, 0.25, 2.0)
+    after = constraint.dual_update(integral, -excess, 0.25, 2.0)
+    assert constraint.pid(after, -excess, excess, 1.0, 0.0, 2.0) == (2 - 0.125 - 0.5 if sign > 0 else 0.125 + 0.5)
 
 
 def test_log_prob_and_entropy_agree_with_scipy():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax.learning.maths.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
+from pmt_jax.learning.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
 
 G = jnp.asarray([-1.0, 0.0])
 
