@@ -9,8 +9,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .config.load import load_config
     from .config.methods import METHODS, Method
-    from .config.settings import Config, load_config
+    from .config.settings import Config
     from .learning.evaluation import evaluate
     from .learning.learner import init, make_train, train_step
     from .learning.setup import make_setup
@@ -24,7 +25,7 @@ _PLACES = {
     "Method": "config.methods",
     "evaluate": "learning.evaluation",
     "init": "learning.learner",
-    "load_config": "config.settings",
+    "load_config": "config.load",
     "load_policy": "policies.load",
     "make_train": "learning.learner",
     "make_setup": "learning.setup",

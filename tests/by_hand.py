@@ -6,7 +6,7 @@ import json
 import pathlib
 
 from pmt_jax import load_config
-from pmt_jax.config.settings import to_toml
+from pmt_jax.config.load import to_toml
 
 
 def made(folder: pathlib.Path, task: str, method: str, seeds: dict[int, list[float | None]], **more: object) -> None:

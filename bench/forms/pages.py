@@ -15,7 +15,7 @@ from typing import Any, Literal
 import envs
 from envs.base import declarations
 from envs.blocks import Blocks, slices
-from pmt_jax.config import toml
+from pmt_jax.config import load
 from pmt_jax.config.methods import METHODS
 from pmt_jax.config.settings import FIELDS, Config
 from pmt_jax.errors import UsageError
@@ -82,7 +82,7 @@ def as_tasks(tasks: str) -> str:
         spec = _task(name).spec
         entries = " or ".join(map(str, sorted({int(n) for n in spec.action_mask.sum(1)}, reverse=True)))
         line = [spec.num_agents, entries, spec.obs_dim, spec.state_dim, spec.horizon, f"{spec.cost_limit:g}"]
-        about = toml.about(name).partition(";")[0]
+        about = load.about(name).partition(";")[0]
         body.append([f"`{name}`", about, *map(str, line)])
     head = ("task", "what", "agents", "action entries", "observation", "state", "steps", "cost limit")
     return markdown(head, body)

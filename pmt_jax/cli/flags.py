@@ -6,10 +6,11 @@ import argparse
 import dataclasses
 from typing import Any
 
-from ..config import toml
-from ..config.fields import GROUPS, expectation
+from ..config import load
+from ..config.fields import GROUPS
+from ..config.load import expectation, load_config
 from ..config.methods import METHODS
-from ..config.settings import FIELDS, Config, load_config
+from ..config.settings import FIELDS, Config
 from .parser import HELP
 
 _METAVARS = {int: "N", float: "X"}
@@ -23,7 +24,7 @@ def add_settings(parser: argparse.ArgumentParser) -> dict[str, argparse._Argumen
     """
     groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
     parser.add_argument(*HELP, action=_Help, help="shows this; after a TASK with the task's own defaults")
-    presets = "; ".join(f"{name}: {about}" for name, about in toml.presets().items())
+    presets = "; ".join(f"{name}: {about}" for name, about in load.presets().items())
     groups["common"].add_argument(
         "--preset", default="default", metavar="WORD", help=f"settings laid over the task's own ({presets})"
     )

@@ -7,7 +7,7 @@ import math
 import pathlib
 from typing import Any
 
-from ..config.settings import convert
+from ..config.load import convert
 from ..errors import UsageError
 from ..output import say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, limits, whole

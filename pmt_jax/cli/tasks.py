@@ -6,8 +6,8 @@ import argparse
 from typing import Any
 
 from .. import tasks
-from ..config import toml
-from ..config.settings import load_config
+from ..config import load
+from ..config.load import load_config
 from ..output import say
 from .parser import command, limits
 from .process import at_once
@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _describe(arguments.task)
     width = max(map(len, tasks.names()))
     for name in tasks.names():
-        say(f"{name:{width}}  {toml.about(name)}")
+        say(f"{name:{width}}  {load.about(name)}")
     say("\npmt envs TASK describes one in full, pmt train TASK --help shows its settings.")
     return 0
 
@@ -41,12 +41,12 @@ def _describe(name: str) -> int:
         "costs": f"{spec.num_costs} an agent; limit {limits(spec.cost_limit)} an episode",
         "horizon": f"{spec.horizon} control steps",
         "engines": _engines(env.engine),
-        "settings": ", ".join(known for known in (name, f"paper/{name}") if known in toml.names()) or "the defaults",
+        "settings": ", ".join(known for known in (name, f"paper/{name}") if known in load.names()) or "the defaults",
     }
-    say(f"{name}: {toml.about(name) or 'a task of your own'}")
+    say(f"{name}: {load.about(name) or 'a task of your own'}")
     for what, text in facts.items():
         say(f"  {what:12} {text}")
-    options = tasks.options(name) | (dict(load_config(name).env) if name in toml.names() else {})
+    options = tasks.options(name) | (dict(load_config(name).env) if name in load.names() else {})
     defaults = ", by default " + ", ".join(f"{k}={v}" for k, v in options.items()) if options else ": it has none"
     say(f"  options      --env NAME=VALUE{defaults}")
     for line in tasks.explain_options(name).splitlines():

@@ -8,7 +8,7 @@ import pathlib
 import sys
 from typing import Any
 
-from ..config.settings import load_config
+from ..config.load import load_config
 from ..errors import UsageError
 from ..output import say
 from .flags import add_settings, given

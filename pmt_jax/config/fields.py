@@ -1,13 +1,11 @@
-"""What a setting is: its type, default, group, meaning and bounds, and how a word becomes a value of that type."""
+"""What a setting is: its type, default, group, meaning and bounds."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import tomllib
-import typing
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 FLOAT32_MAX = 3.4e38  # traced numbers are float32, in which anything larger is infinite
 INT32_MAX = 2**31 - 1
@@ -60,69 +58,3 @@ def _setting(group: str, default: Any, text: str, bound: Bound | None = None) ->
 common, sizes, learning, constraint, emotion, simulation, output = (
     functools.partial(_setting, group) for group in GROUPS
 )
-
-
-def to_type(kind: Any, value: Any) -> Any:
-    """`value` (from TOML, a keyword or a command line) as `kind`.
-
-    Raises:
-      ValueError, TypeError, OverflowError: it does not fit.
-    """
-    parameters = typing.get_args(kind)
-    if typing.get_origin(kind) is Literal:
-        return value if value in parameters else _fail()
-    if kind is bool:
-        words = {"true": True, "false": False}
-        return value if isinstance(value, bool) else words[value] if value in words else _fail()
-    if kind is int:
-        number = _fail() if isinstance(value, bool) else value if isinstance(value, int) else float(value)
-        return int(number) if number == int(number) else _fail()
-    if kind is float:
-        return _fail() if isinstance(value, bool) else float(value)
-    if kind is str:
-        return value if isinstance(value, str) else _fail()
-    if parameters == (int, ...):
-        parts = value.split(",") if isinstance(value, str) else value
-        return tuple(to_type(int, part) for part in parts)
-    if float in parameters:  # a number, or one for each cost
-        parts = value.split(",") if isinstance(value, str) else value
-        several = isinstance(parts, list | tuple) and len(parts) > 1
-        return tuple(to_type(float, part) for part in parts) if several else to_type(float, value)
-    return _options(value)
-
-
-def _options(value: Any) -> tuple[tuple[str, Any], ...]:
-    """A task's own options, from a table, from pairs or from words like `name=value`; the last of a name holds."""
-    items = value.items() if isinstance(value, dict) else value
-    pairs = [item.split("=", 1) if isinstance(item, str) else item for item in items]
-    return tuple(sorted({str(name): _option(x) for name, x in pairs}.items()))
-
-
-def _option(value: Any) -> Any:
-    """An option's value as TOML would read it: numbers, booleans and lists are recognised, other words stay words."""
-    if isinstance(value, list | tuple):
-        return tuple(_option(part) for part in value)
-    if not isinstance(value, str):
-        return value if isinstance(value, int | float) else _fail()
-    try:
-        read = tomllib.loads(f"x = {value}")["x"]
-    except tomllib.TOMLDecodeError:
-        return value
-    return _option(read) if isinstance(read, int | float | list) else read if isinstance(read, str) else value
-
-
-def _fail() -> typing.NoReturn:
-    raise ValueError
-
-
-def expectation(kind: Any) -> str:
-    """What a field of type `kind` takes, in words."""
-    if typing.get_origin(kind) is Literal:
-        return " | ".join(typing.get_args(kind))
-    if kind in (int, float, bool, str):
-        return {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
-    if typing.get_args(kind) == (int, ...):
-        return "whole numbers, as 128,128 (in a file [128, 128])"
-    if float in typing.get_args(kind):
-        return "a number, or one for each cost: 1,0.5"
-    return "name=value"

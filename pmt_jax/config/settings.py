@@ -1,24 +1,17 @@
-"""Settings of a run: one flat frozen dataclass, TOML in, TOML out, no JAX.
+"""Settings of a run: one flat frozen dataclass, no JAX.
 
 `Hyper` holds the numbers that may differ between runs of one compiled program; `Config` adds everything static. The
-metadata of a field define a setting, and `pmt train --help` prints them. A file in `configs/` holds what all
-methods of a task share, then a `[method.NAME]` table of what differs; it may begin with the settings of another:
-`extends = "NAME"`.
+metadata of a field define a setting, and `pmt train --help` prints them. `load` reads them from files and words.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import pathlib
 import typing
 from typing import Any, Literal
 
-import tomli_w
-
 from ..errors import UsageError
-from ..tasks import absolute, did_you_mean, is_file
-from . import toml
 from .fields import (
     AT_LEAST_ONE,
     COUNT,
@@ -34,14 +27,11 @@ from .fields import (
     common,
     constraint,
     emotion,
-    expectation,
     learning,
     output,
     simulation,
     sizes,
-    to_type,
 )
-from .methods import METHODS
 
 
 def _is_limit(value: float | tuple[float, ...]) -> bool:
@@ -323,8 +313,8 @@ class Config(Hyper):
         return self.num_chunks * self.log_interval
 
     def replace(self, **changes: Any) -> Config:
-        """A copy with some fields changed, checked like a new one; values may be strings, as on a command line."""
-        return dataclasses.replace(self, **{k: convert(k, v) for k, v in changes.items()})
+        """A copy with some fields changed, checked like a new one."""
+        return dataclasses.replace(self, **changes)
 
 
 def differences(old: Config, new: Config) -> dict[str, str]:
@@ -340,91 +330,6 @@ def differences(old: Config, new: Config) -> dict[str, str]:
 
 FIELDS: dict[str, Any] = typing.get_type_hints(Config)
 HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
-
-
-def load_config(
-    source: str | pathlib.Path | dict[str, Any],
-    method: str | None = None,
-    preset: str = "default",
-    **overrides: Any,
-) -> Config:
-    """Settings of a task: defaults, then the file, its [method.NAME] table, the preset, then `overrides`.
-
-    A task's own options (`env`) are laid over each other one by one.
-
-    Args:
-      source: a name in configs/ (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
-        a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
-      method: a name in METHODS; the file's own choice if None.
-      preset: a file of configs/presets.
-      **overrides: any field of Config.
-
-    Raises:
-      UsageError: no such file, an unknown field, or a value of the wrong type or range.
-
-    Examples:
-      >>> load_config("lane", method="happo", num_envs=8).num_envs
-      8
-    """
-    table = source if isinstance(source, dict) else _read(source)
-    source = "a [[sweep]]" if isinstance(source, dict) else source
-    own = table.get("method")
-    if method is None:
-        method = own if isinstance(own, str) else str(Config.method)
-    if method not in METHODS:
-        raise UsageError(f"unknown method '{method}'{did_you_mean(method, METHODS)}")
-    layers = [_for_method(source, table, method), _for_method(preset, toml.read_preset(preset), method), overrides]
-    values = {name: value for layer in layers for name, value in layer.items()}
-    if "env" in values:
-        values["env"] = [pair for layer in layers for pair in convert("env", layer.get("env", ()))]
-    if "task" not in values:
-        raise UsageError(f'{source} names no task; add extends = "TASK" with one that pmt envs lists')
-    values["task"] = absolute(str(values["task"]))
-    converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
-    converted["method"] = method
-    return Config(**converted)
-
-
-def _read(source: str | pathlib.Path) -> dict[str, Any]:
-    table = {"task": str(source)} if is_file(str(source)) else toml.read(source)
-    if "sweep" in table:
-        raise UsageError(f"{source} describes a sweep of many runs: pmt sweep {source} --out DIR")
-    return table
-
-
-def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) -> dict[str, Any]:
-    """What a file says of one method: what all share, then the method's own table."""
-    shared = {name: value for name, value in table.items() if name != "method"}
-    tables = table.get("method", {})
-    if isinstance(tables, str):  # a run's own config.toml names its one method
-        return shared
-    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
-        raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
-    for name in tables:
-        if name not in METHODS:
-            raise UsageError(f"unknown method '{name}'{did_you_mean(name, METHODS)}")
-    return shared | tables.get(method, {})
-
-
-def convert(name: str, value: Any) -> Any:
-    """`value` (from TOML, a keyword or a command line) as the type that field `name` has.
-
-    Raises:
-      UsageError: unknown field, or a value that does not fit.
-    """
-    if name not in FIELDS:
-        raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
-    try:
-        return to_type(FIELDS[name], value)
-    except (ValueError, TypeError, OverflowError):
-        raise UsageError(f"{name} = {value!r} does not fit: expected {expectation(FIELDS[name])}") from None
-
-
-def to_toml(config: Config) -> str:
-    """The run's settings as a file that `load_config` reads back to an equal Config."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
-    options = dict(values.pop("env"))
-    return tomli_w.dumps(values | ({"env": options} if options else {}))
 
 
 def _validate(config: Config) -> None:

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..config.settings import Config, to_toml
+from ..config.load import load_config, to_toml
+from ..config.settings import Config
 from ..errors import UsageError
 from ..files import writing
 from ..learning.maths import running_moments
@@ -65,7 +66,7 @@ def load(name: str, physics: str | None = None) -> tuple[Setup, ActingState]:
       UsageError: there is no such policy, or the engine cannot run here.
     """
     table = _read(name)
-    config = Config().replace(**tomllib.loads(str(table.pop("config"))))
+    config = load_config(tomllib.loads(str(table.pop("config"))))
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     del table["about"]
     return setup, checkpoint.unpack(_widened(table), _like(setup))

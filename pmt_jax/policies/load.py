@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 
-from ..config.settings import load_config
+from ..config.load import load_config
 from ..errors import UsageError
 from ..learning.setup import Setup
 from ..learning.types import ActingState

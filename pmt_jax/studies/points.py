@@ -23,8 +23,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..config import toml
-from ..config.settings import FIELDS, Config, convert, load_config
+from ..config import load
+from ..config.load import convert, load_config
+from ..config.settings import FIELDS, Config
 from ..errors import UsageError
 from ..tasks import did_you_mean
 
@@ -217,7 +218,7 @@ def _range(text: Any) -> Range | None:
 
 def has_parts(source: str) -> bool:
     """Whether `source` is a TOML file with a sweep."""
-    return source.endswith(".toml") and "sweep" in toml.read(source)
+    return source.endswith(".toml") and "sweep" in load.read(source)
 
 
 def from_file(file: str | pathlib.Path) -> list[Part]:
@@ -226,7 +227,7 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
     Raises:
       UsageError: no such file or table, or one of another form.
     """
-    shared = toml.read(file)
+    shared = load.read(file)
     tables = shared.pop("sweep", [])
     tables = [tables] if isinstance(tables, dict) else tables
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
@@ -235,10 +236,10 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
 
 
 def _part(file: str | pathlib.Path, shared: dict[str, Any], table: dict[str, Any]) -> Part:
-    base = toml.read(table.pop("extends")) if "extends" in table else {}
+    base = load.read(table.pop("extends")) if "extends" in table else {}
     if base and "task" in shared:
         raise UsageError(f"{file}: a [[sweep]] extends another file only where the file above it names no task")
-    merged = toml.over(toml.over(base, shared), {k: v for k, v in table.items() if k not in PART})
+    merged = load.over(load.over(base, shared), {k: v for k, v in table.items() if k not in PART})
     varied, draws, seed = (table.get(name, default) for name, default in PART.items())
     if not isinstance(varied, dict):
         raise UsageError(f"{file}: set must be a table of settings, like set.lambda_lr = [0.1, 0.3]")

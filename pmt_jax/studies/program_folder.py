@@ -10,7 +10,7 @@ import math
 import pathlib
 from typing import Any
 
-from ..config.settings import load_config
+from ..config.load import load_config
 from ..files import Note, read_rows, to_stderr
 from .points import Points
 

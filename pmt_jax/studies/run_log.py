@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..config.settings import Config, load_config
+from ..config.load import load_config
+from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
 from . import program_folder

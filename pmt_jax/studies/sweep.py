@@ -16,7 +16,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ..config.settings import HYPER_FIELDS, Config, differences, load_config, to_toml
+from ..config.load import load_config, to_toml
+from ..config.settings import HYPER_FIELDS, Config, differences
 from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup

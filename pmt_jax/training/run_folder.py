@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..config.settings import Config, differences, load_config, to_toml
+from ..config.load import load_config, to_toml
+from ..config.settings import Config, differences
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import learner

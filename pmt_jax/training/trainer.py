@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from ..config import toml
+from ..config import load
 from ..config.settings import Config
 from ..errors import UsageError
 from ..learning import sharding
@@ -376,4 +376,4 @@ class Trainer:
             return "the same command with --resume"
         split = f" --devices {self.setup.mesh.size}" if self.setup.mesh else ""
         split += f" --jobs {self.setup.jobs}" if self.setup.jobs > 1 else ""
-        return toml.resume_command(str(self.out)) + split
+        return load.resume_command(str(self.out)) + split

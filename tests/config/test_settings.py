@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 import envs
 from pmt_jax import METHODS, load_config
-from pmt_jax.config import toml
+from pmt_jax.config import load
 from pmt_jax.config.fields import GROUPS
-from pmt_jax.config.settings import Config, to_toml
+from pmt_jax.config.load import to_toml
+from pmt_jax.config.settings import Config
 from pmt_jax.errors import UsageError
 
 
@@ -125,10 +126,10 @@ def test_settings_cannot_be_changed_in_place():
 
 
 def test_configuration_files_hold_no_code_and_no_other_task():
-    names = {name for name in toml.names() if not name.startswith("paper/")}
+    names = {name for name in load.names() if not name.startswith("paper/")}
     assert names == set(envs.names())
-    assert {name.removeprefix("paper/") for name in set(toml.names()) - names} <= names
-    assert all(p.suffix == ".toml" for p in toml.CONFIG_DIR.rglob("*") if p.is_file())
+    assert {name.removeprefix("paper/") for name in set(load.names()) - names} <= names
+    assert all(p.suffix == ".toml" for p in load.CONFIG_DIR.rglob("*") if p.is_file())
 
 
 def test_reading_settings_imports_neither_jax_nor_mujoco():

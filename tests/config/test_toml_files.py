@@ -10,7 +10,7 @@ import pytest
 
 from places import ROOT
 from pmt_jax import load_config
-from pmt_jax.config import toml
+from pmt_jax.config import load
 from pmt_jax.errors import UsageError
 
 
@@ -74,7 +74,7 @@ def test_the_papers_settings_extend_the_tasks_own():
 
 
 def test_every_file_describes_itself():
-    assert all(toml.about(name) for name in toml.names()) and all(toml.presets().values())
+    assert all(load.about(name) for name in load.names()) and all(load.presets().values())
 
 
 def test_all_files_are_packaged():
@@ -84,6 +84,6 @@ def test_all_files_are_packaged():
         path
         for folder, package in folders.items()
         for pattern in patterns[package]
-        for path in (toml.CONFIG_DIR / folder).glob(pattern)
+        for path in (load.CONFIG_DIR / folder).glob(pattern)
     }
-    assert packaged == {path for path in toml.CONFIG_DIR.rglob("*") if path.is_file()}
+    assert packaged == {path for path in load.CONFIG_DIR.rglob("*") if path.is_file()}

@@ -23,8 +23,9 @@ from pmt_jax import tasks
 from pmt_jax.cli import flags
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.parser import refuse_unknown
+from pmt_jax.config.load import load_config
 from pmt_jax.config.methods import METHODS
-from pmt_jax.config.settings import FIELDS, load_config
+from pmt_jax.config.settings import FIELDS
 
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]

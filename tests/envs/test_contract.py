@@ -15,7 +15,7 @@ import pytest
 import envs
 from envs.base import Env, State
 from envs.vector import VectorEnv
-from pmt_jax.config import toml
+from pmt_jax.config import load
 
 BATCH = 4
 # Variants differ from hand_over_2x6 in numbers only, which hands/test_hand_over.py holds.
@@ -62,7 +62,7 @@ def raw_data(tree):
 def test_its_configuration_describes_it(name: str):
     spec = made(name).spec
     for fact in (f" {spec.num_agents} agents", f" {spec.horizon} steps", f"limit {spec.cost_limit:g}"):
-        assert fact in toml.about(name)
+        assert fact in load.about(name)
 
 
 @each_task()

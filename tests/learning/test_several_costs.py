@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pmt_jax import load_config, make_setup
-from pmt_jax.config.settings import to_toml
+from pmt_jax.config.load import to_toml
 from pmt_jax.errors import UsageError
 from pmt_jax.files import read_rows
 from pmt_jax.training.metrics import judged_cost

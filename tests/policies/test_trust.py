@@ -7,7 +7,7 @@ import pathlib
 import pytest
 
 from pmt_jax import load_config, load_policy
-from pmt_jax.config.settings import to_toml
+from pmt_jax.config.load import to_toml
 from pmt_jax.errors import UsageError
 
 EXECUTED = """

@@ -13,7 +13,7 @@ import sys
 import pytest
 
 from pmt_jax import load_config, make_setup
-from pmt_jax.config.settings import to_toml
+from pmt_jax.config.load import to_toml
 from pmt_jax.errors import UsageError
 from pmt_jax.training import claims, run_folder
 

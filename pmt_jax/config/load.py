@@ -1,0 +1,287 @@
+"""Where settings come from: files in configs/ and of the user's own, presets, keywords and words of a command line.
+
+A file in `configs/` holds what all methods of a task share, then a `[method.NAME]` table of what differs; it may begin
+with the settings of another: `extends = "NAME"`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import shlex
+import tomllib
+import typing
+from typing import Any, Literal
+
+import tomli_w
+
+from ..errors import UsageError
+from ..tasks import absolute, did_you_mean, is_file
+from .methods import METHODS
+from .settings import FIELDS, Config
+
+_PACKAGE = pathlib.Path(__file__).parents[1]
+CONFIG_DIR = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
+_PRESETS = "presets"
+
+Table = dict[str, Any]
+
+
+def load_config(
+    source: str | pathlib.Path | dict[str, Any],
+    method: str | None = None,
+    preset: str = "default",
+    **overrides: Any,
+) -> Config:
+    """Settings of a task: defaults, then the file, its [method.NAME] table, the preset, then `overrides`.
+
+    A task's own options (`env`) are laid over each other one by one.
+
+    Args:
+      source: a name in configs/ (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
+        a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
+      method: a name in METHODS; the file's own choice if None.
+      preset: a file of configs/presets.
+      **overrides: any field of Config.
+
+    Raises:
+      UsageError: no such file, an unknown field, or a value of the wrong type or range.
+
+    Examples:
+      >>> load_config("lane", method="happo", num_envs=8).num_envs
+      8
+    """
+    table = source if isinstance(source, dict) else _read(source)
+    source = "a [[sweep]]" if isinstance(source, dict) else source
+    own = table.get("method")
+    if method is None:
+        method = own if isinstance(own, str) else str(Config.method)
+    if method not in METHODS:
+        raise UsageError(f"unknown method '{method}'{did_you_mean(method, METHODS)}")
+    layers = [_for_method(source, table, method), _for_method(preset, read_preset(preset), method), overrides]
+    values = {name: value for layer in layers for name, value in layer.items()}
+    if "env" in values:
+        values["env"] = [pair for layer in layers for pair in convert("env", layer.get("env", ()))]
+    if "task" not in values:
+        raise UsageError(f'{source} names no task; add extends = "TASK" with one that pmt envs lists')
+    values["task"] = absolute(str(values["task"]))
+    converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
+    converted["method"] = method
+    return Config(**converted)
+
+
+def _read(source: str | pathlib.Path) -> dict[str, Any]:
+    table = {"task": str(source)} if is_file(str(source)) else read(source)
+    if "sweep" in table:
+        raise UsageError(f"{source} describes a sweep of many runs: pmt sweep {source} --out DIR")
+    return table
+
+
+def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) -> dict[str, Any]:
+    """What a file says of one method: what all share, then the method's own table."""
+    shared = {name: value for name, value in table.items() if name != "method"}
+    tables = table.get("method", {})
+    if isinstance(tables, str):  # a run's own config.toml names its one method
+        return shared
+    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+        raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
+    for name in tables:
+        if name not in METHODS:
+            raise UsageError(f"unknown method '{name}'{did_you_mean(name, METHODS)}")
+    return shared | tables.get(method, {})
+
+
+def to_toml(config: Config) -> str:
+    """The run's settings as a file that `load_config` reads back to an equal Config."""
+    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    options = dict(values.pop("env"))
+    return tomli_w.dumps(values | ({"env": options} if options else {}))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Files
+
+
+def names() -> list[str]:
+    """The configurations that come with the package, each named by its path in configs/: `lane`, `paper/ant_2x4`."""
+    return [name for name in _names(CONFIG_DIR) if not name.startswith(f"{_PRESETS}/")]
+
+
+def presets() -> dict[str, str]:
+    """What can be laid over any configuration: {name: one sentence about it}."""
+    return {name: about(f"{_PRESETS}/{name}") for name in _names(CONFIG_DIR / _PRESETS)}
+
+
+def _names(folder: pathlib.Path) -> list[str]:
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.toml"))
+
+
+def about(name: str) -> str:
+    """The sentence in which a file of configs/ describes itself; '' if it has none."""
+    path = CONFIG_DIR / f"{name}.toml"
+    return str(_parse(path).get("about", "")) if path.is_file() else ""
+
+
+def read(source: str | pathlib.Path) -> Table:
+    """The settings of a file, laid over those of the file that it `extends`.
+
+    Args:
+      source: one of `names()`, or the path of a TOML file.
+
+    Raises:
+      UsageError: no such file, or one that is not valid.
+    """
+    return _resolve(_find(str(source)), ())
+
+
+def read_preset(name: str) -> Table:
+    """The settings of a preset.
+
+    Raises:
+      UsageError: there is none of that name.
+    """
+    if name not in _names(CONFIG_DIR / _PRESETS):
+        raise UsageError(f"unknown preset '{name}'{did_you_mean(name, _names(CONFIG_DIR / _PRESETS))}")
+    return read(CONFIG_DIR / _PRESETS / f"{name}.toml")
+
+
+def resume_command(out: str) -> str:
+    """What continues the run in the folder `out`, to be typed into a shell."""
+    return shlex.join(["pmt", "train", os.path.join(out, "config.toml"), "--out", out, "--resume"])
+
+
+def _find(source: str) -> pathlib.Path:
+    known = names()
+    if source in known:
+        return CONFIG_DIR / f"{source}.toml"
+    if source.endswith(".toml") or os.path.isfile(source):
+        return pathlib.Path(source)
+    if os.path.isfile(settings := os.path.join(source, "config.toml")):
+        again = resume_command(source)
+        raise UsageError(f"{source} is a run folder; its settings are {settings}, and this continues it: {again}")
+    raise UsageError(f"unknown task '{source}'{did_you_mean(source, known)} (pmt envs lists all)")
+
+
+def _resolve(path: pathlib.Path, below: tuple[pathlib.Path, ...]) -> Table:
+    """A file's settings; `below` are the files that it was reached from by `extends`."""
+    table = _parse(path)
+    table.pop("about", None)
+    base = table.pop("extends", None)
+    if base is None:
+        return table
+    if not isinstance(base, str):
+        raise UsageError(f"{path}: 'extends' must be one name in configs/ or one path, not {base!r}")
+    found = CONFIG_DIR / f"{base}.toml" if base in names() else path.parent / base
+    if not found.is_file():
+        raise UsageError(f"{path} extends '{base}', which is not there{did_you_mean(base, names())}")
+    chain = (*below, path.resolve())
+    if found.resolve() in chain:
+        raise UsageError(f"{path} extends '{base}', which extends it in turn")
+    return over(_resolve(found, chain), table)
+
+
+def over(base: Table, top: Table) -> Table:
+    """`top` laid over `base`, tables within them key by key."""
+    both = {key: over(base[key], top[key]) for key in base.keys() & top.keys() if _tables(base[key], top[key])}
+    return {**base, **top, **both}
+
+
+def _tables(*values: Any) -> bool:
+    return all(isinstance(value, dict) for value in values)
+
+
+def _parse(path: pathlib.Path) -> Table:
+    try:
+        return tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(f"{path} is not valid TOML: {error}") from None
+    except FileNotFoundError:
+        raise UsageError(f"there is no configuration file {path}") from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"cannot read the configuration file {path}: {reason}") from None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Words as values
+
+
+def convert(name: str, value: Any) -> Any:
+    """`value` (from TOML, a keyword or a command line) as the type that field `name` has.
+
+    Raises:
+      UsageError: unknown field, or a value that does not fit.
+    """
+    if name not in FIELDS:
+        raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
+    try:
+        return to_type(FIELDS[name], value)
+    except (ValueError, TypeError, OverflowError):
+        raise UsageError(f"{name} = {value!r} does not fit: expected {expectation(FIELDS[name])}") from None
+
+
+def to_type(kind: Any, value: Any) -> Any:
+    """`value` (from TOML, a keyword or a command line) as `kind`.
+
+    Raises:
+      ValueError, TypeError, OverflowError: it does not fit.
+    """
+    parameters = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return value if value in parameters else _fail()
+    if kind is bool:
+        words = {"true": True, "false": False}
+        return value if isinstance(value, bool) else words[value] if value in words else _fail()
+    if kind is int:
+        number = _fail() if isinstance(value, bool) else value if isinstance(value, int) else float(value)
+        return int(number) if number == int(number) else _fail()
+    if kind is float:
+        return _fail() if isinstance(value, bool) else float(value)
+    if kind is str:
+        return value if isinstance(value, str) else _fail()
+    if parameters == (int, ...):
+        parts = value.split(",") if isinstance(value, str) else value
+        return tuple(to_type(int, part) for part in parts)
+    if float in parameters:  # a number, or one for each cost
+        parts = value.split(",") if isinstance(value, str) else value
+        several = isinstance(parts, list | tuple) and len(parts) > 1
+        return tuple(to_type(float, part) for part in parts) if several else to_type(float, value)
+    return _options(value)
+
+
+def _options(value: Any) -> tuple[tuple[str, Any], ...]:
+    """A task's own options, from a table, from pairs or from words like `name=value`; the last of a name holds."""
+    items = value.items() if isinstance(value, dict) else value
+    pairs = [item.split("=", 1) if isinstance(item, str) else item for item in items]
+    return tuple(sorted({str(name): _option(x) for name, x in pairs}.items()))
+
+
+def _option(value: Any) -> Any:
+    """An option's value as TOML would read it: numbers, booleans and lists are recognised, other words stay words."""
+    if isinstance(value, list | tuple):
+        return tuple(_option(part) for part in value)
+    if not isinstance(value, str):
+        return value if isinstance(value, int | float) else _fail()
+    try:
+        read = tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        return value
+    return _option(read) if isinstance(read, int | float | list) else read if isinstance(read, str) else value
+
+
+def _fail() -> typing.NoReturn:
+    raise ValueError
+
+
+def expectation(kind: Any) -> str:
+    """What a field of type `kind` takes, in words."""
+    if typing.get_origin(kind) is Literal:
+        return " | ".join(typing.get_args(kind))
+    if kind in (int, float, bool, str):
+        return {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
+    if typing.get_args(kind) == (int, ...):
+        return "whole numbers, as 128,128 (in a file [128, 128])"
+    if float in typing.get_args(kind):
+        return "a number, or one for each cost: 1,0.5"
+    return "name=value"
