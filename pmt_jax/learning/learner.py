@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from .. import tasks
 from ..config.settings import Config, Hyper
 from ..errors import UsageError
+from ..limits import columns
 from . import emotions, rollout, sharding
 from .debug import check_finite, watched
 from .maths import lagrangian, running_moments
@@ -20,7 +21,7 @@ from .maths.losses import value_loss
 from .optimise import fit, init_train_state
 from .policy_update import in_lambda_unit, policy_rows, update_policies
 from .rollout import flatten_steps
-from .setup import Setup, make_setup
+from .setup import Setup, held_limit, make_setup
 from .types import Batch, Critic, LearnerState, Metrics, Params, Tag
 
 Train = Callable[..., tuple[LearnerState, Metrics]]
@@ -83,7 +84,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
             else None
         ),
         multiplier=jnp.full(heads, hyper.lambda_init * constrained),
-        episode_cost=jnp.full(heads, lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin)),  # no excess yet
+        episode_cost=jnp.full(heads, held_limit(hyper, hyper.cost_margin)),  # no excess yet
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
         rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
@@ -136,15 +137,24 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     check_finite(setup, state.update, **{**computed, "cost_returns": cost_returns, **learned})
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
-        **rollout.summary(batch),
+        **rollout.summary(batch, setup.shares_cost),
         **rollout.limits_kept(batch, hyper, setup.vector.horizon),
-        "lambda": weigh(multiplier).mean(),
-        "cost_excess": cost_excess.mean(),
+        **_constraint(setup, weigh(multiplier), cost_excess),
         **{f"critic/{k}": x for k, x in critic_metrics.items()},
         **{f"cost_critic/{k}": x for k, x in cost_critic_metrics.items()},
         **{f"actor/{k}": x for k, x in actor_metrics.items()},
         **{f"fear/{k}": x for k, x in fear_metrics.items()},
         **{f"regret/{k}": x for k, x in regret_metrics.items()},
+    }
+
+
+def _constraint(setup: Setup, multiplier: jax.Array, cost_excess: jax.Array) -> Metrics:
+    """Metrics of multipliers and excesses [N, K]: their mean and the largest, then each, see `limits.columns`."""
+    return {
+        "lambda": multiplier.mean(),
+        "cost_excess": cost_excess.max(),
+        **columns("lambda", multiplier, setup.shares_cost),
+        **columns("cost_excess", cost_excess, setup.shares_cost),
     }
 
 
@@ -207,8 +217,7 @@ def _episode_cost(setup: Setup, hyper: Hyper, state: LearnerState, batch: Batch,
 
 def _cost_excess(setup: Setup, hyper: Hyper, episode_cost: jax.Array) -> jax.Array:
     """How far an estimate [N, K] is beyond what the learner holds it to, in cost per step."""
-    held = lagrangian.held_limit(hyper.cost_limit, hyper.cost_margin)
-    return lagrangian.cost_excess(episode_cost, held, setup.vector.horizon)
+    return lagrangian.cost_excess(episode_cost, held_limit(hyper, hyper.cost_margin), setup.vector.horizon)
 
 
 def _weight_of_cost(

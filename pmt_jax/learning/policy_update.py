@@ -14,7 +14,7 @@ from .maths import distributions, lagrangian, trust_region
 from .maths.advantages import standardise
 from .maths.losses import clipped_surrogate, hybrid_advantage
 from .optimise import fit, shuffled
-from .setup import Setup
+from .setup import Setup, held_limit
 from .types import Batch, Hyper, Metrics, Params, PolicyRows, Tag, TrainState
 
 LOWEST = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
@@ -185,7 +185,7 @@ def in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:
         return excess
     # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
     margin = hyper.cost_margin if setup.config.lambda_unit == "relative" else 0.0
-    return lagrangian.in_limits(excess, lagrangian.held_limit(hyper.cost_limit, margin), setup.vector.horizon)
+    return lagrangian.in_limits(excess, held_limit(hyper, margin), setup.vector.horizon)
 
 
 def update_policy(

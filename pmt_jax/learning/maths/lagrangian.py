@@ -6,27 +6,27 @@ import jax
 import jax.numpy as jnp
 
 
-def cost_excess(episode_cost: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
+def cost_excess(episode_cost: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
     """How far the cost is beyond its limit, as cost per step: S = (J - d) / L; positive is too dangerous (Eq. 11).
 
     Args:
-      episode_cost: J [...], undiscounted cost per episode; cost_limit: d in the same unit; horizon: L, in steps.
+      episode_cost: J [...], undiscounted cost per episode; limit: d in the same unit; horizon: L, in steps.
     """
-    return (episode_cost - cost_limit) / horizon
+    return (episode_cost - limit) / horizon
 
 
-def held_limit(cost_limit: jax.Array | float | tuple[float, ...], cost_margin: jax.Array | float) -> jax.Array:
+def held_limit(limit: jax.Array | float | tuple[float, ...], margin: jax.Array | float) -> jax.Array:
     """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
-    return jnp.asarray(cost_limit) * (1 - cost_margin)
+    return jnp.asarray(limit) * (1 - margin)
 
 
-def in_limits(excess: jax.Array, cost_limit: jax.Array | float, horizon: int) -> jax.Array:
+def in_limits(excess: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
     """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
 
     An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit. Where a
     margin is kept, the excess over `held_limit` can be a share of the limit or of what it is held to.
     """
-    return jnp.clip(excess * horizon / jnp.maximum(cost_limit, 1e-6), -1.0, 1.0)
+    return jnp.clip(excess * horizon / jnp.maximum(limit, 1e-6), -1.0, 1.0)
 
 
 def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: jax.Array) -> jax.Array:
