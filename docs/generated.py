@@ -97,10 +97,12 @@ def metrics() -> str:
     return f"""# Metrics
 
 The columns of `metrics.jsonl`. A row is `log_interval` updates of one seed. A value is the mean over the updates of its
-row, unless its meaning says otherwise.
+row, unless its meaning says otherwise. A mean over episodes weighs each episode of the row the same.
 
 * `info/NAME` is a metric of the task's own.
-* `episode_cost/0` is of the first cost, where a task has several.
+* `episode_cost`, `true_episode_cost`, `lambda` and `cost_excess` have parts. `NAME/0` is of the first cost, mean over
+  agents, where a task has several. `NAME/agent_0` is of the first agent, and `NAME/agent_0/cost_0` of its first cost,
+  where agents do not share costs ([how the limit is judged](run_folder.md#within-the-limit)).
 * `eval/NAME` is the mean of NAME over the episodes of an evaluation with mean actions, and `eval/NAME/ci95` is the
   half-width of its 95 % interval. Both are null in rows without an evaluation.
 

@@ -105,9 +105,9 @@ class State:
 class Env(Protocol):
     """What `envs.make` returns: these four are required. All methods are pure and can be jitted and vmapped.
 
-    A fifth is optional: `declares`, the `Declarations`. The tasks of this package also have
-    `raw(state)`, the quantities of a state by name, and `restore(**raw)`, a State made of them: `restore(**raw(state))`
-    continues exactly as `state` would, so that recorded transitions can be replayed.
+    Two more are optional: `declares`, the `Declarations`, and `shares_cost` (see the function of that name). The tasks
+    of this package also have `raw(state)`, the quantities of a state by name, and `restore(**raw)`, a State made of
+    them: `restore(**raw(state))` continues exactly as `state` would, so that recorded transitions can be replayed.
     """
 
     spec: EnvSpec
@@ -199,6 +199,15 @@ class Declarations:
     picture: Plain | Scene | NetworkMap = Plain()
     baselines: Mapping[str, Callable[[], Policy]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None
+
+
+def shares_cost(env: Env) -> bool:
+    """Whether the class of `env` says, by `shares_cost`, that each step costs all agents the same.
+
+    Metrics of costs then have one column for all agents. A subclass may charge its agents otherwise, so it does not
+    inherit this. A task for which it is not so is refused, or its training stops.
+    """
+    return "shares_cost" in vars(type(env)) and bool(getattr(env, "shares_cost", False))
 
 
 def declarations(env: Env) -> Declarations:

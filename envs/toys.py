@@ -45,6 +45,7 @@ class Lane:
     name = "lane"
     cost_limit = 1.0
     engine = "xla"
+    shares_cost = True
 
     @typed
     def __init__(self, num_agents: int = 2) -> None:
@@ -131,6 +132,7 @@ class Switch(Lane):
     """The best action of agent 0's first actuator is 0.9; beyond 0.3 it costs. Nothing moves."""
 
     name = "switch"
+    shares_cost = True
 
     def _get_position(self, position: jax.Array, action: jax.Array) -> jax.Array:
         del action
@@ -151,6 +153,7 @@ class Noisy(Lane):
 
     name = "noisy"
     cost_limit = 0.5
+    shares_cost = True
 
     def _get_cost(self, position: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
         return super()._get_cost(position, action, key) & jax.random.bernoulli(key, 0.3)

@@ -158,10 +158,15 @@ def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
 
 
 def _check_values(env: Env, name: str) -> None:
-    """Plays a reset and two steps, without any action and with the largest in [-1, 1], and checks their numbers."""
+    """Plays a reset and three steps, and checks their numbers.
+
+    The steps are without any action, with the largest in [-1, 1], and with one that differs from agent to agent.
+    """
     import jax
     import jax.numpy as jnp
     import numpy as np
+
+    from .base import shares_cost
 
     def play(key: jax.Array) -> dict[str, jax.Array]:
         def step(state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
@@ -173,7 +178,8 @@ def _check_values(env: Env, name: str) -> None:
 
         start = env.reset(key)
         mask = jnp.asarray(env.spec.action_mask, float)
-        later = jax.lax.scan(step, start, jnp.stack([0 * mask, mask]))[1]
+        apart = mask * jnp.linspace(1.0, -1.0, len(mask))[:, None]
+        later = jax.lax.scan(step, start, jnp.stack([0 * mask, mask, apart]))[1]
         return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), seen(start), later)
 
     found = _guard(f"{name}: the first steps fail", lambda: jax.device_get(jax.jit(play)(jax.random.key(0))))
@@ -185,6 +191,8 @@ def _check_values(env: Env, name: str) -> None:
     low, high = found["cost"].min(), found["cost"].max()
     if low < 0 or high > 1:
         raise TaskError(f"{name}: costs must be within [0, 1], but the first steps give {low if low < 0 else high:g}")
+    if shares_cost(env) and np.ptp(found["cost"], axis=1).any():
+        raise TaskError(f"{name}: it has shares_cost = True, but its agents' costs differ; leave shares_cost out")
 
 
 def _guard(what: str, run: Callable[[], Any]) -> Any:

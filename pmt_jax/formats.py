@@ -16,11 +16,6 @@ def number(x: float | None, form: str = ".4g") -> str:
     return "-" if x is None else format(x, form)
 
 
-def limits(each: Iterable[float]) -> str:
-    """The limit of a cost, or those of several, which are added as the costs are."""
-    return " + ".join(f"{x:g}" for x in each)
-
-
 def write(head: Cells, body: Sequence[Cells], form: str = "text", notes: Sequence[str] = ()) -> str:
     """A table with its notes, which ends in a newline.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from .errors import UsageError
 
 if TYPE_CHECKING:
-    from envs.base import Env, EnvSpec, Policy, State, declarations
+    from envs.base import Env, EnvSpec, Policy, State, declarations, shares_cost
     from envs.columns import Column
     from envs.vector import Outcome, VectorEnv, VectorState, felt_cost
 
@@ -36,6 +36,7 @@ __all__ = [
     "make",
     "names",
     "options",
+    "shares_cost",
 ]
 
 
@@ -51,6 +52,7 @@ def _envs() -> types.ModuleType:
 
 
 _CONTRACT = {"Env": "base", "EnvSpec": "base", "State": "base", "declarations": "base"}
+_CONTRACT |= {"shares_cost": "base"}
 _CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
+from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
@@ -90,7 +91,7 @@ def _compact(log: RunLog) -> Run:
         "source": row.source,
         "task": found.task,
         "method": found.method,
-        "cost_limit": found.cost_limit,
+        "cost_limit": found.limits.total,
         "seconds": float(np.nanmax(log.metrics["seconds"])),
         "versions": log.versions,
         "commit": (records.git("rev-parse", "--short", "HEAD") or "unknown").strip(),
@@ -110,7 +111,7 @@ def curves(run: Run) -> RunLog:
         folder=pathlib.Path(run["task"]),
         task=run["task"],
         method=run["method"],
-        cost_limit=run["cost_limit"],
+        limits=Limits((run["cost_limit"],)),
         settings=tomllib.loads(run["config"]),
         seeds=tuple(run["seeds"]),
         steps=np.array(run["steps"]),
@@ -145,8 +146,8 @@ def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
     cells = _summaries(files)
     tasks, methods = (list(dict.fromkeys(name)) for name in zip(*cells, strict=True))
-    limits = {row.task: row.cost_limit for row, _ in cells.values()}
-    head = ["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)]
+    limits = {row.task: row.limits for row, _ in cells.values()}
+    head = ["", *(f"`{task}` (limit {limits[task]})" for task in tasks)]
     return markdown(head, [[f"`{method}`", *(cells[task, method][1] for task in tasks)] for method in methods])
 
 
@@ -191,7 +192,7 @@ def as_ran(files: pathlib.Path) -> str:
     for name in files.stem.split("+"):
         found = load(files.with_stem(name))
         held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
-        kept = [cost <= run["cost_limit"] for run in held for cost in _scores(run)["cost"]]
+        kept = [beyond <= 0 for run in held for beyond in _row(run).beyond]
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
         line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
@@ -231,7 +232,8 @@ def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
 def _row(run: Run) -> Row:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
-    return Row(run["task"], run["method"], settings, run["cost_limit"], max(run["steps"]), run["source"], _scores(run))
+    limits = Limits((run["cost_limit"],))
+    return Row(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
 
 
 def _scores(run: Run) -> dict[str, np.ndarray]:

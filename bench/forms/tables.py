@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from pmt_jax.formats import markdown
+from pmt_jax.limits import WORST
 
 from ..compare import on_cpu
 from ..records import Report, Row, Rows
@@ -292,7 +293,8 @@ def hub(reports: Reports) -> str:
     head = ("policy", "reward", "cost (limit)", "steps trained", "engine, episodes", "packing: action, reward", "kB")
     rows, body = reports["hub"]["rows"], []
     for row in rows:
-        reward, cost = (row["figures"][f"episode_{what}"] for what in ("reward", "cost"))
+        figures = row["figures"]
+        reward, cost = figures["episode_reward"], figures.get(f"episode_cost{WORST}", figures["episode_cost"])
         moved = row["packed"]["episode_reward"][0] - row["unpacked"]["episode_reward"][0]
         body.append(
             [

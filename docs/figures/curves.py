@@ -63,7 +63,7 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
             if name == "episode_cost":
                 plot.cost_axis(axis, shown, name)
                 axis.set_ylabel("linear up to the limit, then log" if axis.get_yscale() == "symlog" else "")
-                style.name_limit(axis, shown[0].cost_limit)
+                style.name_limit(axis, shown[0].runs[0].limits.total)
             style.label_lines(axis, ends)
         seeds = max(len(group.seeds) for group in shown)
         band = f"mean of {seeds} seeds" + (

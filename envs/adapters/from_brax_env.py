@@ -17,6 +17,8 @@ from ..partition import evenly, parse
 class FromBrax:
     """See `adapters.from_brax`."""
 
+    shares_cost = True
+
     def __init__(
         self,
         env: Any,

@@ -95,6 +95,8 @@ class AntCorridor:
       threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
+    shares_cost = True
+
     @typed
     def __init__(
         self,

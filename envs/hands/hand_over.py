@@ -172,6 +172,8 @@ class HandOver:
       threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
+    shares_cost = True
+
     @typed
     def __init__(
         self,

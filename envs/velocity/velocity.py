@@ -90,6 +90,8 @@ class Velocity:
       threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
+    shares_cost = True
+
     @typed
     def __init__(
         self,

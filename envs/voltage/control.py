@@ -229,6 +229,11 @@ class VoltageControl:
 
     # The contract
 
+    @property
+    def shares_cost(self) -> bool:
+        """Whether each step costs all agents the same."""
+        return self._cost_scope != "zone"
+
     @functools.cached_property
     def declares(self) -> Declarations:
         """A map of the network, and the policies of `baselines`."""

@@ -100,11 +100,6 @@ def names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
-def limits(cost_limit: float | tuple[float, ...]) -> str:
-    """A limit, or that of each cost, in words."""
-    return ", ".join(f"{x:g}" for x in (cost_limit if isinstance(cost_limit, tuple) else (cost_limit,)))
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Flags that several commands share
 

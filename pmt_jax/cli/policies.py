@@ -10,7 +10,7 @@ from typing import Any
 from ..config.load import convert
 from ..errors import UsageError
 from ..output import say
-from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, limits, whole
+from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, whole
 from .process import at_once
 
 
@@ -90,9 +90,11 @@ def run_eval(arguments: argparse.Namespace) -> int:
 
 def _say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
+    from ..limits import Limits
+
     whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
-    say(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
-    metrics = {name: x for name, x in row.items() if isinstance(x, tuple) and name != "cost_limit"}
+    say(f"{whose}(cost limit {Limits.of_row(row)} an episode)")
+    metrics = {name: x for name, x in row.items() if isinstance(x, tuple)}
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
         say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
@@ -114,13 +116,15 @@ def run_export(arguments: argparse.Namespace) -> int:
 def run_hub(arguments: argparse.Namespace) -> int:
     """Lists the pretrained policies."""
     del arguments
+    from ..limits import WORST
     from ..policies import hub
 
     say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
         facts = hub.about(name)
-        (reward, rewards), (cost, costs) = (facts["figures"][f"episode_{what}"] for what in ("reward", "cost"))
-        limit = f"limit {facts['cost_limit']:g}"
+        figures, limit = facts["figures"], f"limit {facts['cost_limit']:g}"
+        reward, rewards = figures["episode_reward"]
+        cost, costs = figures.get(f"episode_cost{WORST}", figures["episode_cost"])
         say(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
     return 0

@@ -9,7 +9,7 @@ from .. import tasks
 from ..config import load
 from ..config.load import load_config
 from ..output import say
-from .parser import command, limits
+from .parser import command
 from .process import at_once
 
 
@@ -32,13 +32,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _describe(name: str) -> int:
+    from ..limits import Limits
+
     env = tasks.make(name)
     spec = env.spec
     actions = sorted({int(n) for n in spec.action_mask.sum(1)})
     facts = {
         "agents": f"{spec.num_agents}, with {' or '.join(map(str, actions))} action entries each",
         "observation": f"{spec.obs_dim} numbers an agent; global state {spec.state_dim}",
-        "costs": f"{spec.num_costs} an agent; limit {limits(spec.cost_limit)} an episode",
+        "costs": f"{spec.num_costs} an agent; limit {Limits.of_task(spec)} an episode",
         "horizon": f"{spec.horizon} control steps",
         "engines": _engines(env.engine),
         "settings": ", ".join(known for known in (name, f"paper/{name}") if known in load.names()) or "the defaults",

@@ -13,9 +13,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from ..limits import columns
 from .rollout import finished_mean
 from .schedules import Schedule
-from .setup import Setup
+from .setup import Setup, held_limit
 from .types import Batch, Constraint, Hyper, Metrics, PolicyRows
 
 LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
@@ -33,7 +34,7 @@ def init(setup: Setup, hyper: Hyper) -> Constraint:
 
 def target(hyper: Hyper) -> jax.Array:
     """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
-    return jnp.asarray(hyper.cost_limit) * (1 - hyper.cost_margin)
+    return held_limit(hyper, hyper.cost_margin)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -90,7 +91,7 @@ def excess_in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.
     if setup.config.lambda_unit == "step":
         return excess
     # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
-    limit = target(hyper) if setup.config.lambda_unit == "relative" else jnp.asarray(hyper.cost_limit)
+    limit = target(hyper) if setup.config.lambda_unit == "relative" else held_limit(hyper, 0.0)
     return relative_excess(excess, limit, setup.vector.horizon)
 
 
@@ -208,10 +209,12 @@ def relative_update(
 
 
 def metrics(setup: Setup, constraint: Constraint, price: jax.Array, excess: jax.Array) -> Metrics:
-    """What an update reports of it, means over agents and costs."""
-    shown = {"lambda": price.mean(), "cost_excess": excess.mean()}
+    """What an update reports: means over agents and costs, of excesses the largest; then each, see `limits.columns`."""
+    shown = {"lambda": price.mean(), "cost_excess": excess.max()}
+    shown |= columns("lambda", price, setup.shares_cost) | columns("cost_excess", excess, setup.shares_cost)
     if setup.method.constraint == "trust_region":
         shown["limit_lowered"] = constraint.lowered.mean()
+        shown |= columns("limit_lowered", constraint.lowered, setup.shares_cost)
     return shown
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from .. import tasks
+from .. import limits, tasks
 from . import sharding
 from .rollout import Feel, cost_beyond
 from .setup import Setup
@@ -47,8 +47,8 @@ def evaluate(
       record: also return every step, as in `play`.
 
     Returns:
-      The metrics of `play`, and within_limit [episodes]: whether an episode's cost (the true one, of several each felt
-      one) is within its limit.
+      The metrics of `play`, and within_limit [episodes]: whether each cost of each agent (the true one, of several each
+      felt one) is within its limit.
     """
     felt = setup.hyper if hyper is None else hyper
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
@@ -62,12 +62,9 @@ def evaluate(
         step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
         return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
 
-    metrics = play(setup.vector.env, act, episodes, feel, fresh, record)
-    count = setup.vector.spec.num_costs
-    names = [f"episode_cost/{k}" for k in range(count)] if count > 1 else ["episode_cost"]
-    costs = jnp.stack([metrics[name] for name in names], axis=-1)
-    beyond = cost_beyond(costs, metrics["true_episode_cost"][:, None], felt, setup.vector.horizon)
-    return metrics | {"within_limit": jnp.all(beyond == 0, axis=-1).astype(costs.dtype)}
+    metrics, costs = _play(setup.vector.env, act, episodes, feel, fresh, record)
+    beyond = cost_beyond(*costs, felt, setup.vector.horizon)
+    return metrics | {"within_limit": jnp.all(beyond == 0, axis=(-2, -1)).astype(beyond.dtype)}
 
 
 def play(
@@ -88,13 +85,20 @@ def play(
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
-      what the costs were before `feel`), episode_cost/k of each of several costs, and the task's info (means over the
-      episode), each [episodes]; all undiscounted. With `record` also `step/NAME` [horizon, episodes, ...]: obs (before
-      the action), action, reward, cost as felt, true_cost, terminated, truncated, info/NAME; 0 after an episode's end.
+      what the costs were before `feel`), each agent's and cost's episode_cost/... and true_episode_cost/... (see
+      `limits.columns`), and the task's info (means over the episode), each [episodes]; all undiscounted. With `record`
+      also `step/NAME` [horizon, episodes, ...]: obs (before the action), action, reward, cost as felt, true_cost,
+      terminated, truncated, info/NAME; 0 after an episode's end.
     """
-    vector = tasks.VectorEnv(env, episodes)
-    mask = jnp.asarray(vector.spec.action_mask)
-    several = range(vector.spec.num_costs if vector.spec.num_costs > 1 else 0)
+    return _play(env, act, episodes, feel, fresh, record)[0]
+
+
+def _play(
+    env: tasks.Env, act: Act, episodes: int, feel: Feel, fresh: bool, record: bool
+) -> tuple[Metrics, tuple[jax.Array, jax.Array]]:
+    """What `play` returns, and the episodes' costs [episodes, N, K], as felt and as they were."""
+    vector, spec = tasks.VectorEnv(env, episodes), env.spec
+    mask = jnp.asarray(spec.action_mask)
     step_per_device = sharding.per_device(vector.step)
 
     def step(
@@ -104,32 +108,41 @@ def play(
         seen, action = state.env.obs, act(state.env, t) * mask
         state, outcome = step_per_device(state, action)
         each = feel(outcome.cost, t)
-        cost, true_cost = each.sum(-1), outcome.cost.sum(-1)
         now = {
             "episode_reward": outcome.reward,
-            "episode_cost": cost.mean(-1),
+            "episode_cost": each,
             "episode_length": jnp.ones_like(outcome.reward),
-            "violation_rate": cost.max(-1) > 0,
-            "true_episode_cost": true_cost.mean(-1),
-            "true_violation_rate": true_cost.max(-1) > 0,
-            **{f"episode_cost/{k}": each[..., k].mean(-1) for k in several},
+            "violation_rate": (each > 0).any((-2, -1)),
+            "true_episode_cost": outcome.cost,
+            "true_violation_rate": (outcome.cost > 0).any((-2, -1)),
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
-        sums = {name: sums[name] + alive * now[name] for name in sums}
+        sums = {name: sums[name] + _masked(now[name], alive) for name in sums}
         kept = _recorded(seen, action, each, outcome, alive) if record else {}
         return (state, alive & ~(outcome.terminated | outcome.truncated), sums), kept
 
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
     start = vector.reset(jax.random.fold_in(key, vector.horizon))
-    names = [f"episode_cost/{k}" for k in several]
-    names += ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
-    names += ["true_episode_cost", "true_violation_rate"]
+    names = ["episode_reward", "episode_length", "violation_rate", "true_violation_rate"]
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
+    costs = ("episode_cost", "true_episode_cost")
+    sums |= {name: jnp.zeros((episodes, spec.num_agents, spec.num_costs), start.env.reward.dtype) for name in costs}
     carry = (start, jnp.ones(episodes, bool), sums)
     (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
-    per_step = [name for name in sums if not name.removeprefix("true_").startswith("episode_")]
-    return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
+    felt, true = (sums.pop(name) for name in costs)
+    per_step = [name for name in sums if not name.startswith("episode_")]
+    found = {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
+    shared = tasks.shares_cost(env)
+    for name, cost in zip(costs, (felt, true), strict=True):
+        found[name] = cost.sum(-1).mean(-1)
+        found |= limits.worst(name, cost, shared) | limits.columns(name, cost, shared)
+    return found, (felt, true)
+
+
+def _masked(x: jax.Array, alive: jax.Array) -> jax.Array:
+    """What a step gave [B, ...], 0 where an episode has ended."""
+    return jnp.where(alive.reshape(alive.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
 
 
 def _recorded(
@@ -146,11 +159,7 @@ def _recorded(
         "truncated": outcome.truncated,
         **{f"info/{name}": x for name, x in outcome.info.items()},
     }
-
-    def masked(x: jax.Array) -> jax.Array:
-        return jnp.where(alive.reshape(alive.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
-
-    return {f"{STEP}{name}": masked(x) for name, x in kept.items()}
+    return {f"{STEP}{name}": _masked(x, alive) for name, x in kept.items()}
 
 
 def interval(x: np.ndarray) -> tuple[float, float]:

@@ -139,7 +139,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     check_finite(setup, state.update, **computed, **learned)
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
-        **rollout.summary(batch),
+        **rollout.summary(batch, setup.shares_cost),
         **rollout.limits_kept(batch, hyper, horizon),
         **constraint.metrics(setup, held, price(held.multiplier), excess),
         **_named("critic", critic_metrics),

@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import limits
 from ..tasks import Outcome, State, VectorEnv
 from . import sharding
 from .maths import distributions
+from .setup import held_limit
 from .types import Batch, Hyper, RolloutState
 
 Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
@@ -128,13 +130,14 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
 def limits_kept(batch: Batch, hyper: Hyper, horizon: int) -> dict[str, jax.Array]:
     """How the episodes that ended kept their limits, scalars; nan if none ended.
 
-    within_limit: share of them whose cost is within the limit, of several costs each. episode_cost_beyond: their mean
-    cost beyond it, 0 of an episode within it, in the limit's unit; of several costs the sum.
+    within_limit: share of them in which each cost of each agent is within its limit. episode_cost_beyond: their mean
+    cost beyond it, 0 of an episode within it, in the limit's unit: that of the agent furthest beyond, of several costs
+    the sum.
     """
-    beyond = cost_beyond(batch.episode_cost.mean(2), batch.true_episode_cost.mean(2), hyper, horizon)
+    beyond = cost_beyond(batch.episode_cost, batch.true_episode_cost, hyper, horizon)
     return {
-        "within_limit": finished_mean(batch, jnp.all(beyond == 0, axis=-1)),
-        "episode_cost_beyond": finished_mean(batch, beyond.sum(-1)),
+        "within_limit": finished_mean(batch, jnp.all(beyond == 0, axis=(-2, -1))),
+        "episode_cost_beyond": finished_mean(batch, beyond.max(-2).sum(-1)),
     }
 
 
@@ -144,20 +147,22 @@ def cost_beyond(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) ->
     The limit is on what is felt, so a true cost counts as what it is expected to be felt as, see `Setup.limits`.
     """
     cost = felt if felt.shape[-1] > 1 else hyper.cost_seen * true + hyper.cost_false * (horizon - true)
-    limit = jnp.asarray(hyper.cost_limit)
-    # Both are rounded to 32 bits, and a cost that is its limit must not be beyond it.
-    return jnp.where(cost > limit * (1 + 1e-6), cost - limit, 0.0)
+    return jnp.maximum(limits.excess(cost, held_limit(hyper, 0.0), jnp), 0.0)
 
 
-def summary(batch: Batch) -> dict[str, jax.Array]:
+def summary(batch: Batch, shares_cost: bool = False) -> dict[str, jax.Array]:
     """Metrics of a batch, scalars; episode metrics are means over the episodes that ended (nan if none did).
 
     episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
-    summed over K). violation_rate: share of steps with a cost above 0 for some agent. step_reward, step_cost: means
-    per step. Costs are as felt; true_episode_cost, true_violation_rate and true_step_cost are the same of the true
-    costs (see `envs.vector.felt_cost`).
+    summed over K), and beside it each agent's and cost's, see `limits.columns`. violation_rate: share of steps with a
+    cost above 0 for some agent. step_reward, step_cost: means per step. Costs are as felt; true_episode_cost,
+    true_violation_rate and true_step_cost are the same of the true costs (see `envs.vector.felt_cost`).
+
+    Args:
+      shares_cost: whether the task declares that agents share their costs; `cost_spread` then says how far they differ.
     """
     cost, true_cost = batch.cost.sum(-1), batch.true_cost.sum(-1)
+    spread = {"cost_spread": (batch.true_cost.max(2) - batch.true_cost.min(2)).max()} if shares_cost else {}
     return {
         "episode_reward": finished_mean(batch, batch.episode_reward),
         "episode_cost": finished_mean(batch, batch.episode_cost.sum(-1).mean(-1)),
@@ -171,20 +176,15 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "true_violation_rate": (true_cost.max(-1) > 0).mean(),
         "true_step_cost": true_cost.mean(),
         "non_finite": batch.non_finite.sum(),
-        **_each_cost(batch),
+        **spread,
+        **_each_cost("episode_cost", finished_mean(batch, batch.episode_cost), shares_cost),
+        **_each_cost("true_episode_cost", finished_mean(batch, batch.true_episode_cost), shares_cost),
         **{f"info/{name}": x.mean() for name, x in batch.info.items()},
     }
 
 
-def _each_cost(batch: Batch) -> dict[str, jax.Array]:
-    """The episode costs one by one, if there are several: `episode_cost/k` and `true_episode_cost/k`."""
-    costs = {"episode_cost": batch.episode_cost, "true_episode_cost": batch.true_episode_cost}
-    count = batch.cost.shape[-1]
-    return {
-        f"{name}/{k}": finished_mean(batch, cost[..., k].mean(-1))
-        for name, cost in costs.items()
-        for k in range(count if count > 1 else 0)
-    }
+def _each_cost(name: str, mean: jax.Array, shares_cost: bool) -> dict[str, jax.Array]:
+    return limits.worst(name, mean, shares_cost) | limits.columns(name, mean, shares_cost)
 
 
 def flatten_steps(x: jax.Array) -> jax.Array:

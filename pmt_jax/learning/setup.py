@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ from .. import tasks
 from ..config.methods import METHODS, Method
 from ..config.settings import HYPER_FIELDS, Config, Hyper
 from ..errors import UsageError
+from ..limits import Limits
 from . import networks
 from .maths import running_moments
 from .types import RunningMoments
@@ -50,29 +50,23 @@ class Setup:
     debug: bool = False
 
     @property
-    def limits(self) -> np.ndarray:
-        """Allowed undiscounted felt cost of one agent per episode: [K], one for each cost.
-
-        The config's; if that is nan, what an episode that truly costs the task's limit d is expected to be
-        felt as: cost_seen d + cost_false (horizon - d).
-        """
-        config, count = self.config, self.vector.spec.num_costs
-        if isinstance(config.cost_limit, tuple) or not math.isnan(config.cost_limit):
-            return np.broadcast_to(np.asarray(config.cost_limit, float), count)
-        limit = np.broadcast_to(np.asarray(self.vector.spec.cost_limit, float), count)
-        return config.cost_seen * limit + config.cost_false * (self.vector.horizon - limit)
+    def limits(self) -> Limits:
+        """What the learner holds the costs of every agent to, as it observes them."""
+        return Limits.of_run(self.config, self.vector.spec, self.vector.horizon)
 
     @property
-    def cost_limit(self) -> float:
-        """The sum of `limits`, beside the episode cost, which is a sum over costs too."""
-        return float(self.limits.sum())
-
-    @property
-    def cost_limits(self) -> np.ndarray:
-        """`limits` of everything that trains side by side: [config.seeds, K]."""
-        limits = np.asarray(self.trials.hyper.cost_limit if self.trials else self.limits)
+    def limits_of_seeds(self) -> list[Limits]:
+        """`limits` of everything that trains side by side, `config.seeds` of them."""
+        if self.trials is None:
+            return [self.limits] * self.config.seeds
         count = self.vector.spec.num_costs
-        return np.broadcast_to(limits.reshape(-1, count), (self.config.seeds, count))
+        each = np.asarray(self.trials.hyper.cost_limit).reshape(-1, count)
+        return [Limits(tuple(one)) for one in np.broadcast_to(each, (self.config.seeds, count)).tolist()]
+
+    @property
+    def shares_cost(self) -> bool:
+        """Whether the task declares that each step costs all its agents the same."""
+        return tasks.shares_cost(self.vector.env)
 
     @property
     def overflow(self) -> str | None:
@@ -87,7 +81,7 @@ class Setup:
     @property
     def hyper(self) -> Hyper:
         """The numbers of `config` that are traced, as f32 scalars; of several costs, the limits are one array [K]."""
-        limits = self.limits if self.vector.spec.num_costs > 1 else self.cost_limit
+        limits = self.limits.each if self.vector.spec.num_costs > 1 else self.limits.total
         values = {name: getattr(self.config, name) for name in HYPER_FIELDS} | {"cost_limit": limits}
         traced: dict[str, Any] = {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
         return Hyper(**traced)
@@ -99,6 +93,11 @@ class Setup:
         if self.trials is None:
             return self.hyper, keys(jnp.arange(self.config.seed, self.config.seed + self.config.seeds)), (None, 0)
         return self.trials.hyper, keys(self.trials.seed), (0 if jnp.ndim(self.trials.hyper.clip) else None, 0)
+
+
+def held_limit(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
+    """The limits [] or [K] of an episode's costs less a margin, a share of them; traced."""
+    return jnp.asarray(hyper.cost_limit) * (1 - margin)
 
 
 def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:

@@ -11,9 +11,10 @@ import numpy as np
 from .. import tasks
 from ..errors import UsageError
 from ..files import writing
-from ..learning.evaluation import STEP, interval, play
+from ..learning.evaluation import STEP, play
 from ..learning.setup import Setup
 from ..learning.types import ActingState
+from ..limits import Limits
 from ..training.compile import evaluate_seeds
 from ..training.health import NO_ROOM
 from ..training.metrics import seed_intervals
@@ -70,9 +71,8 @@ def evaluate_states(
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
     if save:
         results = _save_steps(save, results, setup.config.seed)
-    limit = tuple(setup.limits.tolist()) if len(setup.limits) > 1 else setup.cost_limit
     return [
-        {"seed": setup.config.seed + i, "cost_limit": limit, "step": step, **figures}
+        {"seed": setup.config.seed + i, **setup.limits.columns, "step": step, **figures}
         for i, (figures, step) in enumerate(zip(seed_intervals(results), _steps(setup, state), strict=True))
     ]
 
@@ -94,10 +94,9 @@ def evaluate_baseline(
     act = jax.vmap(tasks.baseline(env, policy))
     record = save is not None
     results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes, record=record))())
-    if save:
-        one_seed = _save_steps(save, {name: x[None] for name, x in results.items()}, 0)
-        results = {name: x[0] for name, x in one_seed.items()}
-    return {"cost_limit": env.spec.cost_limit, **{name: interval(x) for name, x in results.items()}}
+    one_seed = {name: x[None] for name, x in results.items()}
+    (figures,) = seed_intervals(_save_steps(save, one_seed, 0) if save else one_seed)
+    return {**Limits.of_task(env.spec).columns, **figures}
 
 
 def _check_ending(save: pathlib.Path | None) -> None:

@@ -22,6 +22,8 @@ from ..learning import rollout
 from ..learning.evaluation import is_better
 from ..learning.setup import Setup
 from ..learning.types import ActingState, TrainState
+from ..limits import base
+from ..training.metrics import judged_cost
 from ..training.run_folder import load_saved
 from . import hub
 from .evaluate import evaluate_states
@@ -81,12 +83,14 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     acting = [ActingState(TrainState(state.actor.params, None), state.obs_moments, state.update) for state in states]
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *acting)
     rows = evaluate_states(run, both, episodes, deterministic=True, fresh=False)
-    reward, cost = (np.array([row[f"episode_{what}"][0] for row in rows]) for what in ("reward", "cost"))
+    means = [{name: x[0] if isinstance(x, tuple) else x for name, x in row.items()} for row in rows]
+    reward = np.array([row["episode_reward"] for row in means])
+    cost, limit = np.array([judged_cost(row, "") for row in means]).T
     # A limit that training did not use does not count: MAPPO's best would be a policy that has hardly learned.
-    limit = np.inf if run.method.constraint == "none" else run.cost_limit
+    limit = np.full_like(limit, np.inf) if run.method.constraint == "none" else limit
     chosen, reached = None, (np.array(-np.inf), np.array(np.inf))
     for i, new in enumerate(zip(reward, cost, strict=True)):
-        if is_better(*new, *reached, limit):
+        if is_better(*new, *reached, limit[i]):
             chosen, reached = i, new
     if chosen is None:
         raise UsageError(f"no policy in {folder} has a finite reward and cost")
@@ -101,8 +105,8 @@ def figures(row: dict[str, Any]) -> dict[str, list[float]]:
 
 
 def _chosen_by(row: dict[str, Any]) -> dict[str, list[float]]:
-    """The values that choose a policy."""
-    return {name: figures(row)[name] for name in ("episode_reward", "episode_cost")}
+    """The values that choose a policy, those of each agent and cost, too."""
+    return {name: x for name, x in figures(row).items() if base(name) in ("episode_reward", "episode_cost")}
 
 
 def action_change(run: Setup, packed: ActingState, original: ActingState, environments: int = 8) -> float:

@@ -15,6 +15,7 @@ from .. import tasks
 from ..learning.evaluation import EVALUATION_KEY
 from ..learning.setup import Setup
 from ..learning.types import ActingState
+from ..limits import Limits
 from ..policies.load import load_seed
 
 
@@ -24,11 +25,11 @@ class Episode:
 
     Attributes:
       env: the environment it was played in; method, seed: whose policy played.
-      cost_limit: on the episode's summed cost.
+      limits: on each agent's summed costs.
       raw: {name: [T + 1, ...]}, what the task's picture reads of each moment.
       step: [T + 1] control steps since the reset.
       reward, cost: [T + 1] of the step that led to each moment; cost is the mean over agents, summed over costs.
-      reward_sum, cost_sum: [T + 1] of the episode so far.
+      reward_sum, cost_sum: [T + 1] of the episode so far; the cost is that of the agent who has the most.
       info: {name: [T + 1]} the task's metrics.
       action: [T + 1, N, A] that led to each moment; 0 at the reset.
     """
@@ -36,7 +37,7 @@ class Episode:
     env: tasks.Env
     method: str
     seed: int
-    cost_limit: float
+    limits: Limits
     raw: dict[str, np.ndarray]
     step: np.ndarray
     reward: np.ndarray
@@ -94,7 +95,7 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
       number: [] which of the fixed starts.
 
     Returns:
-      raw, reward, cost, info, action, terminated with a leading [horizon + 1]; see `Episode`.
+      raw, reward, cost, info, action, terminated with a leading [horizon + 1]; see `Episode`, but cost is each agent's.
     """
     env = setup.vector.env
     mask, picture = jnp.asarray(env.spec.action_mask), tasks.declarations(env).picture
@@ -103,8 +104,13 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
     def moment(s: tasks.State, action: jax.Array) -> dict[str, Any]:
         found = picture.raw(s)
         raw = {k: x for k, x in found.items() if x is not None and not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)}
-        cost = s.cost.sum(-1).mean()
-        step = {"reward": s.reward, "cost": cost, "info": s.info, "action": action, "terminated": s.terminated}
+        step = {
+            "reward": s.reward,
+            "cost": s.cost.sum(-1),
+            "info": s.info,
+            "action": action,
+            "terminated": s.terminated,
+        }
         return {"raw": raw, **step}
 
     def step(s: tasks.State, t: jax.Array) -> tuple[tasks.State, dict[str, Any]]:
@@ -126,7 +132,9 @@ def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
     broken = np.asarray(~np.isfinite(np.concatenate(floats, axis=1)).all(axis=1))
     ends = np.flatnonzero(moments.pop("terminated") & ~broken) + 1
     length = min([len(broken), *ends[:1], *np.flatnonzero(broken)[:1]])
-    sums = {"reward_sum": moments["reward"].cumsum(), "cost_sum": moments["cost"].cumsum()}
+    costs = moments.pop("cost")
+    moments["cost"] = costs.mean(1)
+    sums = {"reward_sum": moments["reward"].cumsum(), "cost_sum": costs.cumsum(0).max(1)}
     steps = np.arange(len(broken))
-    whole = Episode(setup.vector.env, setup.config.method, seed, setup.cost_limit, step=steps, **moments, **sums)
+    whole = Episode(setup.vector.env, setup.config.method, seed, setup.limits, step=steps, **moments, **sums)
     return whole.cut(slice(length))

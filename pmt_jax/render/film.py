@@ -100,7 +100,7 @@ def _captioned(episode: Episode, frames: Iterator[np.ndarray]) -> Iterator[np.nd
             draw.rectangle((k / last * width - 1, top, (k + 1) / last * width - 1, height), fill=DANGER)
         draw.rectangle((t / last * width - 2, top - 2, t / last * width + 1, height), fill=INK)
         costs_now = episode.cost[t] > 0
-        sums = f"reward {episode.reward_sum[t]:.1f}   cost {episode.cost_sum[t]:g} (limit {episode.cost_limit:g})"
+        sums = f"reward {episode.reward_sum[t]:.1f}   cost {episode.cost_sum[t]:g} (limit {episode.limits})"
         words = f"step {episode.step[t]}   {sums}"
         font = ImageFont.load_default(size)
         box = (0, top - 1.7 * size, draw.textlength(words, font) + size, top)

@@ -49,7 +49,7 @@ def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
         "kind": kind,
         "title": f"{episode.env.spec.name}, {episode.method}, seed {episode.seed}",
         "rate": rate,
-        "limit": episode.cost_limit,
+        "limit": str(episode.limits),
         "step": episode.step.tolist(),
         "reward": _numbers(episode.reward),
         "cost": _numbers(episode.cost),

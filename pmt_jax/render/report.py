@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import UsageError
 from ..files import writing
-from ..formats import limits
+from ..limits import WORST
 from ..policies import evaluate
 from ..studies import plot, table
 from ..studies.rows import rows
@@ -123,7 +123,7 @@ def _summary(log: RunLog) -> str:
     took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
     return (
         f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "
-        f"limit on an episode's cost {limits(log.limits)}."
+        f"limit on an episode's cost {log.limits}."
     )
 
 
@@ -140,8 +140,9 @@ def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
     found = {kind: evaluate.evaluate_run(folder, episodes, mean) for kind, mean in kinds.items()}
     results = [(kind, row) for kind in kinds for row in found[kind]]
     first = results[0][1]
-    main = [name for name in ("episode_reward", "episode_cost", "within_limit", "violation_rate") if name in first]
-    others = [name for name, x in first.items() if isinstance(x, tuple) and name not in (*main, "cost_limit")]
+    wanted = ("episode_reward", "episode_cost", f"episode_cost{WORST}", "within_limit", "violation_rate")
+    main = [name for name in wanted if name in first]
+    others = [name for name, x in first.items() if isinstance(x, tuple) and name not in main]
 
     def listing(names: Sequence[str]) -> str:
         cells = (

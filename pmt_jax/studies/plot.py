@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..files import Note, writing
+from ..limits import WORST
 from ..tasks import columns
 from .rows import in_order, same
 from .run_log import Group, RunLog, groups, read_all
@@ -20,9 +21,11 @@ POINTS = 100  # of a curve
 TRAINING = {
     "episode_reward": "reward of an episode",
     "episode_cost": "cost of an episode (dashed: limit)",
+    f"episode_cost{WORST}": "cost of the worst agent (dashed: limit)",
     "violation_rate": "share of steps with a cost",
     "lambda": "multiplier",
     "true_episode_cost": "true cost of an episode (dashed: limit)",
+    f"true_episode_cost{WORST}": "true cost of the worst agent (dashed: limit)",
     "true_violation_rate": "share of steps with a true cost",
     "true_step_cost": "true cost of a step",
 }
@@ -36,7 +39,7 @@ EMOTIONS = {
     "regret/weight_mean": "regret: mean weight of a ratio",
     "regret/weight_std": "regret: spread of the weights",
 }
-COSTS = ("episode_cost", "true_episode_cost")
+COSTS = tuple(name for name in TRAINING if "episode_cost" in name)
 
 # Okabe and Ito's colours, which the colour-blind tell apart, on white and on black; one for each method, everywhere.
 BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
@@ -241,8 +244,7 @@ def cost_axis(axis: Any, shown: Sequence[Group], name: str) -> None:
     """The limit as a dashed line; linear up to it, logarithmic beyond if costs are many times as high."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
-    limits = {group.true_limit if name.startswith("true") else group.cost_limit for group in shown}
-    limits = sorted(limit for limit in limits if math.isfinite(limit))
+    limits = sorted({on.total for group in shown if (on := group.runs[0].limits_on(name))})
     for limit in limits:
         axis.axhline(limit, color=INK, ls="--", lw=1)
     top = max(np.nanmax(curve(group, name)[1], initial=0.0) for group in shown)

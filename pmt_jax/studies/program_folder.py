@@ -6,12 +6,13 @@
 
 from __future__ import annotations
 
-import math
 import pathlib
 from typing import Any
 
 from ..config.load import load_config
+from ..config.settings import Config
 from ..files import Note, read_rows, to_stderr
+from ..limits import KEY, Limits
 from .points import Points
 
 
@@ -36,13 +37,17 @@ def rows(folder: pathlib.Path, group: Points, note: Note = to_stderr) -> dict[st
     every = read_rows(folder / "run" / "metrics.jsonl", note=note)
     found, first = {}, 0
     for name, config in group.items():
-        trials, limit = range(first, first + config.seeds), config.cost_limit
-        # Rows of several points know a limit in single precision only.
-        own = {"cost_limit": limit} if isinstance(limit, float) and not math.isnan(limit) else {}
+        trials = range(first, first + config.seeds)
         theirs = [row for row in every if row.get("seed") in trials]
-        found[name] = [row | own | _own_seed(row, config.seed - first) for row in theirs]
+        found[name] = [row | _own_limits(row, config) | _own_seed(row, config.seed - first) for row in theirs]
         first = trials.stop
     return found
+
+
+def _own_limits(row: dict[str, Any], config: Config) -> dict[str, float]:
+    """The limits that a point's settings say, which rows of several points know in single precision only."""
+    own = Limits.configured(config, len(Limits.of_row(row).each)) if KEY in row else None
+    return own.columns if own else {}
 
 
 def _own_seed(row: dict[str, Any], offset: int) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from ..config.methods import METHODS
 from ..errors import UsageError
 from ..files import Note
-from ..formats import limits
+from ..limits import WORST, Limits
 from ..tasks import columns as task_columns
 from . import statistics
 from .run_log import Group, RunLog, groups
@@ -45,8 +45,10 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("reward", "episode_reward", note="reward: undiscounted, of the team, per episode"),
     Column("cost", "episode_cost", 0, note="cost: undiscounted, of one agent (mean over agents), per episode"),
+    Column("worst agent", f"episode_cost{WORST}", 0, note="worst agent: cost of the agent whose is highest"),
     Column("violation rate", "violation_rate", 0, 1, "violation rate: share of steps with a cost for some agent"),
     Column("true cost", "true_episode_cost", 0, note="true: with the costs that the team did not feel"),
+    Column("true worst agent", f"true_episode_cost{WORST}", 0),
     Column("true violation rate", "true_violation_rate", 0, 1),
     Column("true step cost", "true_step_cost", 0),
     Column(
@@ -84,41 +86,37 @@ class Row:
 
     Attributes:
       task, method: their names; settings: what differs from other rows of the same task, as `name=value`.
-      cost_limit: allowed cost of one agent per episode.
+      limits: on the costs of any agent.
       steps: environment steps per seed (the fewest, if runs differ).
       source: `evaluation` or `training`, what the scores are taken from.
       scores: {column: [seeds]} in the task's units; nan if a seed has none.
-      excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` if None.
-      limits: of each cost; the one if empty.
-      true_limit: on true costs; nan if unknown.
+      excess: [seeds] cost beyond the limit, see `RunLog.excess`; of the cost in `scores` if None.
+      true_limits: on true costs; None if unknown.
     """
 
     task: str
     method: str
     settings: str
-    cost_limit: float
+    limits: Limits
     steps: int
     source: str
     scores: dict[str, np.ndarray]
     excess: np.ndarray | None = None
-    limits: tuple[float, ...] = ()
-    true_limit: float = math.nan
+    true_limits: Limits | None = None
 
     def score(self, column: str) -> np.ndarray:
-        """[seeds] of a column, nan if the row does not have it."""
+        """[seeds] of a column, nan if the row does not have it; where agents share costs, all are the worst agent."""
         nothing = np.full(len(next(iter(self.scores.values()), [0])), np.nan)
-        return self.scores.get(column, nothing)
+        return self.scores.get(column, self.scores.get(column.replace("worst agent", "cost"), nothing))
 
     @property
     def beyond(self) -> np.ndarray:
-        """[seeds] cost beyond the limit, of several costs the worst; below 0 within it."""
-        return self.score("cost") - self.cost_limit if self.excess is None else self.excess
+        """[seeds] cost beyond the limit, of the agent and cost furthest beyond; at most 0 within it."""
+        return self.limits.excess(self.score("worst agent")[:, None, None]) if self.excess is None else self.excess
 
     def limit_on(self, column: str) -> str:
         """The limit on the costs of a column, in words."""
-        if column == "true cost" and math.isfinite(self.true_limit):
-            return f"{self.true_limit:g}"
-        return limits(self.limits or (self.cost_limit,))
+        return str(self.true_limits or self.limits if column.startswith("true ") else self.limits)
 
     @property
     def label(self) -> str:
@@ -163,13 +161,12 @@ def _row(group: Group) -> Row:
         task=group.task,
         method=group.method,
         settings=group.settings,
-        cost_limit=group.cost_limit,
+        limits=first.limits,
         steps=int(min(run.steps[-1] for run in group.runs)),
         source="evaluation" if first.evaluated else "training",
         scores={name: x for name, x in scores.items() if x is not None},
         excess=np.concatenate([run.excess for run in group.runs]),
-        limits=first.limits,
-        true_limit=group.true_limit,
+        true_limits=first.true_limits,
     )
 
 
@@ -187,5 +184,6 @@ def same(true: np.ndarray | None, felt: np.ndarray | None) -> bool:
 
 
 def compared(rows: Sequence[Row]) -> tuple[str, str]:
-    """The columns that rows are compared by: reward, and the cost as it was, felt or not."""
-    return "reward", "true cost" if "true cost" in [column.name for column in shown(rows)] else "cost"
+    """The columns that rows are compared by: reward, and the cost as it was, felt or not, of the worst agent."""
+    names = [column.name for column in shown(rows)]
+    return "reward", next(x for x in ("true worst agent", "true cost", "worst agent", "cost") if x in (*names, "cost"))

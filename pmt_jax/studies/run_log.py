@@ -18,11 +18,12 @@ from ..config.load import load_config
 from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
+from ..limits import KEY, WORST, Limits, judged, of_agents
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
-IDENTITY = {"step": int, "seed": int, "task": str, "method": str, "cost_limit": float}  # what every row says
+IDENTITY = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
 TEXT = ("broken",)  # besides
 
 
@@ -33,7 +34,7 @@ class RunLog:
     Attributes:
       folder: where it lies.
       task, method: what was trained, and how.
-      cost_limit: allowed cost of one agent per episode.
+      limits: on the costs of any agent.
       settings: {setting: value}, the task's own options as env.NAME.
       seeds: [S], ascending.
       steps: [P] environment steps of one seed, ascending.
@@ -45,7 +46,7 @@ class RunLog:
     folder: pathlib.Path
     task: str
     method: str
-    cost_limit: float
+    limits: Limits
     settings: dict[str, Any]
     seeds: tuple[int, ...]
     steps: np.ndarray
@@ -57,7 +58,7 @@ class RunLog:
     def identity(self) -> str:
         """Equal for two runs that are the same up to their seeds."""
         learned = {name: value for name, value in self.settings.items() if name not in NOT_LEARNING}
-        return repr((self.task, self.method, self.cost_limit, sorted(learned.items()) or self.folder))
+        return repr((self.task, self.method, self.limits, sorted(learned.items()) or self.folder))
 
     @property
     def evaluated(self) -> bool:
@@ -67,9 +68,20 @@ class RunLog:
     def final(self, name: str) -> np.ndarray | None:
         """[S] means of a metric over the last tenth of the steps, nan for a seed that broke; None if unknown.
 
-        If evaluations were made there, they replace the training episodes.
+        If evaluations were made there, they replace the training episodes. `..._worst` is the agent with the highest of
+        these means, unknown where agents share their costs.
         """
-        source = f"eval/{name}" if self.evaluated else name
+        source = self._source(name)
+        if not name.endswith(WORST):
+            return self._final(source)
+        mean = source.removesuffix(WORST)
+        each = of_agents({x: self._final(x) for x in self.metrics if x.startswith(f"{mean}/agent_")}, mean)
+        return np.max(each, axis=0) if each else None
+
+    def _source(self, name: str) -> str:
+        return f"eval/{name}" if self.evaluated else name
+
+    def _final(self, source: str) -> np.ndarray | None:
         if source not in self.metrics:
             return None
         values = self._last(source)
@@ -86,36 +98,34 @@ class RunLog:
 
     @property
     def excess(self) -> np.ndarray:
-        """[S] how far each seed's cost at the end (see `final`) is beyond its limit; of several the worst as felt.
+        """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest.
 
         If not all of one cost is felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones
         are felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
         """
-        if len(self.limits) > 1:
-            costs = (self._final(f"episode_cost/{k}") for k in range(len(self.limits)))
-            return np.max([cost - limit for cost, limit in zip(costs, self.limits, strict=True)], axis=0)
-        missed, false = self.settings.get("cost_seen", 1.0) < 1, self.settings.get("cost_false", 0.0)
-        if missed and not false and "true_episode_cost" in self.metrics:
-            return self._final("true_episode_cost") - self.true_limit
-        return self._final("episode_cost") - self.cost_limit
+        seen = self.settings.get("cost_seen", 1.0)
+        true = seen < 1 and len(self.limits.each) == 1 and self.true_limits is not None
+        if true and "true_episode_cost" in self.metrics:
+            return self.limits.true(seen).excess(self._costs("true_episode_cost"))
+        return self.limits.excess(self._costs("episode_cost"))
 
     @property
-    def limits(self) -> tuple[float, ...]:
-        """Of each cost; the costs and their limits are added in `cost_limit`."""
-        each = [self.metrics[name].T for name in sorted(self.metrics) if name.startswith("cost_limit/")]
-        known = [x[np.isfinite(x)] for x in each]  # in the order of the steps: --change may have changed them
-        return tuple(float(x[-1]) for x in known if x.size) or (self.cost_limit,)
-
-    @property
-    def true_limit(self) -> float:
-        """The limit on true costs, of which the team feels a share; nan if it feels false ones, too."""
+    def true_limits(self) -> Limits | None:
+        """The limits on true costs, of which the team feels a share; None if it feels false ones, too."""
         if self.settings.get("cost_false", 0.0):
-            return math.nan  # depends on the time limit, which a run folder does not say
-        return self.cost_limit / self.settings.get("cost_seen", 1.0)
+            return None  # they depend on the time limit, which a run folder does not say
+        return self.limits.true(self.settings.get("cost_seen", 1.0))
 
-    def _final(self, name: str) -> np.ndarray:
-        found = self.final(name)
-        return np.full(len(self.seeds), np.nan) if found is None else found
+    def limits_on(self, metric: str) -> Limits | None:
+        """The limits on a metric of costs; None if they are unknown."""
+        return self.true_limits if metric.startswith("true_") else self.limits
+
+    def _costs(self, name: str) -> np.ndarray:
+        """[S, N, K] the final means of what a cost is judged by; nan where unknown."""
+        names = judged(self.metrics, self._source(name), len(self.limits.each))
+        unknown = np.full(len(self.seeds), np.nan)
+        each = [[unknown if (x := self._final(column)) is None else x for column in costs] for costs in names]
+        return np.moveaxis(np.array(each), -1, 0)
 
     def until(self, step: int) -> RunLog:
         """The same run as if it had ended after this step.
@@ -237,7 +247,7 @@ def _log(folder: pathlib.Path, rows: Sequence[dict[str, Any]], metrics: pathlib.
         folder=folder,
         task=last["task"],
         method=last["method"],
-        cost_limit=last["cost_limit"],
+        limits=Limits.of_row(last),
         settings=flat(config) | _changes(metrics.parent),
         seeds=tuple(seeds),
         steps=np.array(steps),
@@ -337,16 +347,6 @@ class Group:
     def method(self) -> str:
         """How it was trained."""
         return self.runs[0].method
-
-    @property
-    def cost_limit(self) -> float:
-        """The limit on what the team feels."""
-        return self.runs[0].cost_limit
-
-    @property
-    def true_limit(self) -> float:
-        """The limit on what the costs are, felt or not."""
-        return self.runs[0].true_limit
 
     @property
     def label(self) -> str:

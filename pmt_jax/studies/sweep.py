@@ -225,8 +225,8 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         if (out / name / "config.toml").is_file():
             continue
         first = number * config.seeds  # of its trials
-        limit = dataclasses.replace(setup, config=config).cost_limit  # the task's own, too, not rounded
-        mine = [row | {"cost_limit": limit} for row in rows[name]]
+        limits = dataclasses.replace(setup, config=config).limits  # the task's own, too, not rounded
+        mine = [row | limits.columns for row in rows[name]]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()

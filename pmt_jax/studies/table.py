@@ -14,6 +14,7 @@ import numpy as np
 from .. import formats
 from ..errors import UsageError
 from ..formats import number
+from ..limits import KEY
 from ..tasks import did_you_mean
 from . import compare, statistics
 from .rows import Column, Row, compared, shown
@@ -80,7 +81,7 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
         cost, against = row.score(compared(table)[1]), comparisons.get((row.task, row.label))
         given = numbers.get(row.task, {})
         data: dict[str, Any] = {"task": row.task, "method": row.method, "settings": row.settings}
-        data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, "cost_limit": row.cost_limit}
+        data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, KEY: row.limits.total}
         data |= {c.name: _estimate(row.scores[c.name], c) for c in shown(table) if c.name in row.scores}
         data |= {"within": float((row.beyond <= 0).mean()), "worst": _finite(cost.max())}
         data |= {"better": against and against.better, "p": against and against.p}
@@ -148,7 +149,7 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
         "; ".join(column.note for column in shown(table) if column.note) + ".",
         "limit: the cost allowed; seeds within: seeds whose cost is within it; worst seed: the highest cost of a seed."
         + " Of several costs, which are added, each must be within its own limit."
-        * any(len(r.limits) > 1 for r in table),
+        * any(len(r.limits.each) > 1 for r in table),
         "Interquartile mean over seeds, below four the mean [95 % studentised interval]; -: unknown, or not finite for "
         "some seed; [-]: one seed has no interval.",
     ]

@@ -27,6 +27,16 @@ def overflow(setup: Setup, rows: list[Row]) -> str | None:
     )
 
 
+def unshared(row: Row, spread: float) -> str | None:
+    """What is wrong, if agents' costs of a step differ by `spread` though their task declares that they share costs."""
+    if not spread > 0:
+        return None
+    return (
+        f"task '{row['task']}' has shares_cost = True, but its agents' costs differ by up to {spread:.2g} in a step "
+        f"up to step {row['step']:,}, which no column shows; leave shares_cost out"
+    )
+
+
 def diagnose(setup: Setup, index: int, row: Row, finite: bool) -> str | None:
     """Why a seed cannot train on after this row; None if it can.
 

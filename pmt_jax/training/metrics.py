@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -11,9 +10,10 @@ import numpy as np
 
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
+from ..limits import WORST, Limits, base, judged, of_agents
 
 Row = dict[str, Any]
-Reduction = Literal["mean", "sum", "loss"]
+Reduction = Literal["mean", "episodes", "sum", "loss"]
 
 
 class Metric(NamedTuple):
@@ -23,7 +23,7 @@ class Metric(NamedTuple):
       unit: of its values.
       definition: what it measures, over the updates of one row.
       reduction: how the updates of a row become one value. `mean` leaves out what is not finite, `loss` does not: a
-        loss that was not finite even once must show.
+        loss that was not finite even once must show. `episodes` weighs each update by the episodes that ended in it.
     """
 
     unit: str
@@ -39,26 +39,41 @@ METRICS: dict[str, Metric] = {
     "cost_limit": Metric("cost", "allowed undiscounted cost of one agent per episode"),
     "broken": Metric("", "why the seed stopped training; null while it trains"),
     "seconds": Metric("s", "wall time spent training since the run began, without compiling, over all its sessions"),
-    "episode_reward": Metric("reward", "undiscounted sum of the team's reward over an episode, mean over the episodes"),
-    "episode_cost": Metric("cost", "the same of one agent's cost, mean over agents"),
-    "episode_length": Metric("steps", "control steps of an episode, mean over the episodes that ended"),
+    "episode_reward": Metric(
+        "reward", "undiscounted sum of the team's reward over an episode, mean over the episodes that ended", "episodes"
+    ),
+    "episode_cost": Metric("cost", "the same of one agent's cost, mean over agents", "episodes"),
+    "episode_cost_worst": Metric(
+        "cost", "the same of the agent whose cost is highest, where agents do not share costs"
+    ),
+    "episode_length": Metric("steps", "control steps of an episode, mean over the episodes that ended", "episodes"),
     "episodes": Metric("", "episodes that ended", "sum"),
     "terminations": Metric("", "episodes ended by the task's rule, or by its limit if `time_limit = terminate`", "sum"),
     "violation_rate": Metric("", "share of steps with a cost above 0 for some agent"),
     "within_limit": Metric(
-        "", "share of the episodes that ended whose cost is within the limit, of several costs each"
+        "", "share of the episodes that ended in which each cost of each agent is within its limit", "episodes"
     ),
     "episode_cost_beyond": Metric(
-        "cost", "how far their cost is beyond the limit, 0 of one within it, mean over them; of several costs the sum"
+        "cost",
+        "how far the agent that is furthest beyond the limit is beyond it, 0 of an episode within it, mean over the "
+        "episodes that ended; of several costs the sum",
+        "episodes",
     ),
     "step_reward": Metric("reward", "reward of a control step"),
     "step_cost": Metric("cost", "cost of a control step, mean over agents"),
-    "true_episode_cost": Metric("cost", "episode_cost before `cost_seen` and `cost_false`: what the costs were"),
+    "true_episode_cost": Metric(
+        "cost", "episode_cost before `cost_seen` and `cost_false`: what the costs were", "episodes"
+    ),
+    "true_episode_cost_worst": Metric("cost", "the same of the agent whose cost is highest"),
     "true_violation_rate": Metric("", "violation_rate of what the costs were"),
     "true_step_cost": Metric("cost", "step_cost of what the costs were"),
     "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
     "lambda": Metric("", "the multiplier, with the gains of PID, mean over agents and costs; 0 without one"),
-    "cost_excess": Metric("cost per step", "how far the estimated episode cost is beyond the limit less `cost_margin`"),
+    "cost_excess": Metric(
+        "cost per step",
+        "how far the estimated episode cost is beyond the limit less `cost_margin`, of the agent and cost furthest "
+        "beyond",
+    ),
     "limit_lowered": Metric("cost per step", "by how much MACPO keeps below the limit less `cost_margin`, mean"),
     "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),
     "critic/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
@@ -97,24 +112,26 @@ LOSSES = tuple(name for name, metric in METRICS.items() if metric.reduction == "
 
 
 def describe(name: str) -> Metric:
-    """What a column of metrics.jsonl means; `info/...` is the task's own, `eval/...` is of an
-    evaluation, `.../0` is of the first cost.
+    """What a column of metrics.jsonl means; `info/...` is the task's own, `eval/...` is of an evaluation.
+
+    `.../0` is of the first cost, mean over agents; `.../agent_0` and `.../agent_0/cost_0` are of the first agent.
 
     Raises:
       KeyError: there is no such metric.
     """
     if name.startswith("eval/"):
-        base = name.removeprefix("eval/").removesuffix("/ci95")
-        of = describe(base)
+        measure = name.removeprefix("eval/").removesuffix("/ci95")
+        of = describe(measure)
         what = "half-width of the 95 % interval of" if name.endswith("/ci95") else "mean over evaluation episodes of"
-        return Metric(of.unit, f"{what} {base}, mean actions; null in rows without an evaluation")
+        return Metric(of.unit, f"{what} {measure}, mean actions; null in rows without an evaluation")
     if name.startswith("info/"):
         return Metric("", f"the task's own `{name.removeprefix('info/')}`, mean per control step")
-    return METRICS[re.sub(r"/\d+$", "", name)]
+    return METRICS[base(name)]
 
 
 def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> list[Row]:
-    """A chunk's metrics [seeds, updates, ...] as one row per seed."""
+    """A chunk's metrics [seeds, updates, ...] as one row per seed; each of episodes weighs the same."""
+    episodes = np.asarray(metrics["episodes"])
     config = setup.config
     return [
         {
@@ -122,47 +139,51 @@ def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> lis
             "seed": config.seed + i,
             "task": setup.vector.spec.name,
             "method": config.method,
-            "cost_limit": float(limits.sum()),
-            **({f"cost_limit/{k}": float(x) for k, x in enumerate(limits)} if len(limits) > 1 else {}),
+            **limits.columns,
             "broken": None,
-            **{name: _reduce(name, np.asarray(values[i])) for name, values in metrics.items()},
+            **_worst_of_row({name: _reduce(name, np.asarray(x[i]), episodes[i]) for name, x in metrics.items()}),
         }
-        for i, limits in enumerate(setup.cost_limits)
+        for i, limits in enumerate(setup.limits_of_seeds)
     ]
 
 
-def limits_of(row: Row) -> list[float]:
-    """The limit of each cost."""
-    return [x for name, x in row.items() if name.startswith("cost_limit/")] or [row["cost_limit"]]
+def _worst_of_row(row: Row) -> Row:
+    """The same, but the worst agent is that of the row: each update may have another, so their mean is too high."""
+    worst = [name for name in row if name.endswith(WORST)]
+    return row | {name: float(np.max(of_agents(row, name.removesuffix(WORST)))) for name in worst}
 
 
 def judged_cost(row: Row, prefix: str) -> tuple[float, float]:
-    """What a row's cost is judged by, and the limit of that: of several costs, the largest excess, and 0.
+    """What a row's cost is judged by, and the limit of that: of several agents or costs, the largest excess, and 0.
 
     Args:
       prefix: `eval/` to judge the evaluation, else nothing.
     """
-    count = sum(name.startswith("cost_limit/") for name in row)
-    if not count:
-        return row[f"{prefix}episode_cost"], row["cost_limit"]
-    return max(row[f"{prefix}episode_cost/{k}"] - row[f"cost_limit/{k}"] for k in range(count)), 0.0
+    limits = Limits.of_row(row)
+    names = judged(row, f"{prefix}episode_cost", len(limits.each))
+    if names == [[f"{prefix}episode_cost"]]:
+        return row[f"{prefix}episode_cost"], limits.total
+    return float(limits.excess([[row[name] for name in costs] for costs in names])), 0.0
 
 
 def without_metrics(row: Row, reason: str) -> Row:
     """The row of a seed that trains no more: what names it, and nan for all that was measured."""
-    named = ("step", "seed", "task", "method", "cost_limit", "seconds")
-    kept = {name: x for name, x in row.items() if name in named or name.startswith("cost_limit/")}
+    named = ("step", "seed", "task", "method", "seconds")
+    kept = {name: row[name] for name in named if name in row} | Limits.of_row(row).columns
     return {**dict.fromkeys(row, math.nan), **kept, "broken": reason}
 
 
-def _reduce(name: str, values: np.ndarray) -> float | int:
-    reduction = METRICS[name].reduction if name in METRICS else "mean"
+def _reduce(name: str, values: np.ndarray, episodes: np.ndarray) -> float | int:
+    """One value of those of updates [U], in each of which so many `episodes` [U] ended."""
+    metric = METRICS.get(base(name))
+    reduction = metric.reduction if metric else "mean"
     if reduction == "sum":
         return int(values.sum())
     if reduction == "loss":
         return float(values.mean())
-    seen = values[np.isfinite(values)]
-    return float(seen.mean()) if seen.size else math.nan
+    seen = np.isfinite(values)
+    weights = episodes[seen] if reduction == "episodes" else None
+    return float(np.average(values[seen], weights=weights)) if seen.any() else math.nan
 
 
 def seed_intervals(results: Mapping[str, np.ndarray]) -> list[dict[str, tuple[float, float]]]:

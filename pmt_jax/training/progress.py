@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from ..formats import limits
+from ..limits import WORST, Limits
 from ..output import dropped_if_closed
-from .metrics import Row, limits_of
+from .metrics import Row
 
 HISTORY = 12  # rows of the live table
 GAP = 2  # characters between its columns
@@ -27,7 +27,7 @@ COLUMNS = {
     "steps/s": 4,
     "time left": 3,
 }
-AVERAGED = ("episode_reward", "episode_cost", "violation_rate", "lambda")
+AVERAGED = ("episode_reward", "episode_cost", f"episode_cost{WORST}", "violation_rate", "lambda")
 
 
 def duration(seconds: float) -> str:
@@ -60,7 +60,7 @@ class Progress:
     def show(self, rows: list[Row], steps_per_second: float) -> None:
         """Shows a chunk's rows, one per seed; `steps_per_second` are of all seeds."""
         for name in AVERAGED:
-            values = [row[name] for row in rows if math.isfinite(row[name])]
+            values = [row[name] for row in rows if math.isfinite(row.get(name, math.nan))]
             if values:
                 self._latest[name] = sum(values) / len(values)
         step = rows[0]["step"]
@@ -68,8 +68,8 @@ class Progress:
         cells = (
             f"{step:,}",
             self._number("episode_reward", ".1f"),
-            self._number("episode_cost", ".2f"),
-            ", ".join(dict.fromkeys(limits(limits_of(row)) for row in rows)),
+            self._cost(),
+            ", ".join(dict.fromkeys(str(Limits.of_row(row)) for row in rows)),
             self._number("violation_rate", ".2%"),
             self._number("lambda", ".3f"),
             f"{steps_per_second:,.0f}",
@@ -80,6 +80,11 @@ class Progress:
 
     def _number(self, name: str, form: str) -> str:
         return format(self._latest[name], form) if name in self._latest else "-"
+
+    def _cost(self) -> str:
+        """The mean over agents; where they do not share costs, also what is held against the limit."""
+        worst = self._number(f"episode_cost{WORST}", ".2f")
+        return self._number("episode_cost", ".2f") + (f", worst agent {worst}" if worst != "-" else "")
 
     def _print(self, cells: tuple[str, ...], last: bool) -> None:
         self._history = [*self._history, cells][-HISTORY:]

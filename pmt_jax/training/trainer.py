@@ -275,11 +275,11 @@ class Trainer:
         state, metrics = self.programs.chunk(self.state)
         metrics = jax.device_get(metrics)
         self._rate = self.config.seeds * self.config.log_interval * self.config.batch_size / (time.monotonic() - begin)
-        finite = metrics.pop("finite")
+        finite, spread = metrics.pop("finite"), metrics.pop("cost_spread", np.zeros((self.config.seeds, 1)))
         self.step += self.config.log_interval * self.config.batch_size
         rows = make_rows(self.setup, self.step, metrics)
         gone = dict(self.broken)
-        self._find_broken(rows, finite)
+        self._find_broken(rows, finite, spread.max(1))
         if self.broken:
             broken = np.array([i in self.broken for i in range(self.config.seeds)])
             state = self.programs.take(broken, state, self.state)  # self.state stays whole: `train` may go back to it
@@ -288,10 +288,10 @@ class Trainer:
             rows[i] = without_metrics(rows[i], reason) if i in gone else rows[i] | {"broken": reason}
         return rows
 
-    def _find_broken(self, rows: list[Row], finite: np.ndarray) -> None:
+    def _find_broken(self, rows: list[Row], finite: np.ndarray, spread: np.ndarray) -> None:
         overflow = health.overflow(self.setup, [row for i, row in enumerate(rows) if i not in self.broken])
         for i, row in enumerate(rows):
-            reason = overflow or health.diagnose(self.setup, i, row, bool(finite[i]))
+            reason = overflow or health.unshared(row, spread[i]) or health.diagnose(self.setup, i, row, bool(finite[i]))
             if reason and i not in self.broken:
                 self.broken[i] = reason
 

@@ -39,9 +39,9 @@ def test_one_agents_cost_alone_makes_a_step_costly():
 
 def test_the_tasks_limit_follows_what_is_felt():
     small = {"num_envs": 4, "rollout_length": 16, "minibatches": 1}
-    assert make_setup(load_config("lane", cost_seen=0.1, **small)).cost_limit == pytest.approx(0.1)
-    assert make_setup(load_config("lane", cost_false=0.5, **small)).cost_limit == pytest.approx(1 + 0.5 * 24)
-    assert make_setup(load_config("lane", cost_seen=0.1, cost_limit=0.7, **small)).cost_limit == pytest.approx(0.7)
+    assert make_setup(load_config("lane", cost_seen=0.1, **small)).limits.total == pytest.approx(0.1)
+    assert make_setup(load_config("lane", cost_false=0.5, **small)).limits.total == pytest.approx(1 + 0.5 * 24)
+    assert make_setup(load_config("lane", cost_seen=0.1, cost_limit=0.7, **small)).limits.total == pytest.approx(0.7)
 
 
 @pytest.mark.parametrize("change", [{"cost_seen": 0}, {"cost_seen": 1.5}, {"cost_false": 1}, {"cost_false": -0.1}])

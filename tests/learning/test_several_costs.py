@@ -42,7 +42,7 @@ def task(tmp_path: pathlib.Path) -> str:
 
 def test_limits_are_the_tasks_or_one_for_all_or_a_list(task: str):
     def limits(**changes: object) -> list[float]:
-        return make_setup(load_config(task, **SMALL, **changes)).limits.tolist()
+        return list(make_setup(load_config(task, **SMALL, **changes)).limits.each)
 
     assert limits() == [1.0, 0.5]
     assert limits(cost_limit=2) == [2.0, 2.0]
@@ -84,4 +84,4 @@ def test_rows_and_evaluations_name_each_cost(task: str, tmp_path: pathlib.Path, 
     np.testing.assert_allclose(
         last["eval/episode_cost"], last["eval/episode_cost/0"] + last["eval/episode_cost/1"], rtol=1e-6
     )
-    assert "(cost limit 1, 0.5 an episode)" in cli("eval", out, "--episodes", 2, "--deterministic", "--trust")[1]
+    assert "(cost limit 1 + 0.5 an episode)" in cli("eval", out, "--episodes", 2, "--deterministic", "--trust")[1]

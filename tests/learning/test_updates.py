@@ -357,7 +357,9 @@ def test_share_of_episodes_within_and_cost_beyond_the_limit():
     assert rollout.cost_beyond(costs, jnp.zeros((2, 2)), hyper_of(setup, [1.0, 2.0]), 25).tolist() == [[0, 0], [2, 0]]
     felt = make_setup(load_config("lane", cost_seen=0.5, cost_false=0.1))  # a limit of 1 of 25 steps
     true = jnp.asarray([[0.9], [1.1], [4.0]])
-    beyond = rollout.cost_beyond(true, true, dataclasses.replace(felt.hyper, cost_limit=jnp.asarray(felt.limits)), 25)
+    beyond = rollout.cost_beyond(
+        true, true, dataclasses.replace(felt.hyper, cost_limit=jnp.asarray(felt.limits.each)), 25
+    )
     np.testing.assert_allclose(beyond, [[0], [0.04], [1.2]], atol=1e-6)  # felt: 0.4 of each
 
 

@@ -134,7 +134,7 @@ def test_a_policy_of_the_package(name: str):
     facts = hub.about(name)
     assert f"hub:{run.config.task}/{run.config.method}" == name == f"hub:{facts['task']}/{facts['method']}"
     assert (run.config.seed, run.config.seeds, run.config.physics) == (facts["seed"], 1, "auto")
-    assert run.cost_limit == facts["cost_limit"]
+    assert run.limits.total == facts["cost_limit"]
     assert int(state.update[0]) * run.config.batch_size == facts["step"]
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(state))
 

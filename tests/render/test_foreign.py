@@ -12,6 +12,7 @@ import pytest
 
 from by_hand import row, written
 from places import ROOT
+from pmt_jax.limits import Limits
 from pmt_jax.render import episode, film, report
 
 EXAMPLE = ROOT / "docs" / "examples" / "my_env.py"
@@ -62,7 +63,7 @@ def test_names_are_no_code_in_a_replay(tmp_path: pathlib.Path, monkeypatch: pyte
         env=env,
         method="<b>",
         seed=0,
-        cost_limit=1.0,
+        limits=Limits((1.0,)),
         raw={},
         step=np.arange(3),
         reward=zero,

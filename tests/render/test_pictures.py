@@ -20,6 +20,7 @@ from envs.base import Declarations, Scene
 from envs.voltage.layout import layout
 from pmt_jax import tasks
 from pmt_jax.errors import UsageError
+from pmt_jax.limits import Limits
 from pmt_jax.render import episode, film, gl, network_map, page, report
 
 
@@ -32,7 +33,7 @@ def still(name: str, raw: dict[str, np.ndarray], cost: list[float], **options: s
         env=env,
         method="mappo_l",
         seed=0,
-        cost_limit=env.spec.cost_limit,
+        limits=Limits.of_task(env.spec),
         raw=raw,
         step=np.arange(len(costs)),
         reward=zero,
@@ -273,7 +274,9 @@ def test_limits_of_several_costs_are_no_metric_of_a_report(monkeypatch: pytest.M
     result = {
         "seed": 0,
         "step": 1,
-        "cost_limit": (1.0, 2.0, 3.0),
+        "cost_limit": 3.0,
+        "cost_limit/0": 1.0,
+        "cost_limit/1": 2.0,
         "episode_reward": (1.0, 0.5),
         "info/speed": (2.0, 0.1),
     }

@@ -9,6 +9,7 @@ import numpy as np
 
 from by_hand import row, written
 from pmt_jax.config.methods import METHODS
+from pmt_jax.limits import Limits
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group, RunLog, groups, read
 
@@ -17,7 +18,9 @@ def run(method: str, seeds: int = 1, folder: str = "x", **settings: object) -> R
     values = np.linspace(0, 1, 20) + np.arange(seeds)[:, None]
     metrics = {"episode_reward": values, "episode_cost": 50 * values}
     named = {"method": method, **settings}
-    return RunLog(pathlib.Path(folder), "lane", method, 1.0, named, tuple(range(seeds)), np.arange(1, 21), metrics)
+    return RunLog(
+        pathlib.Path(folder), "lane", method, Limits((1.0,)), named, tuple(range(seeds)), np.arange(1, 21), metrics
+    )
 
 
 def group(*methods: str) -> list[Group]:
@@ -83,7 +86,7 @@ def test_true_costs_are_drawn_where_not_all_are_felt():
         "true_episode_cost",
         "true_violation_rate",
     ]
-    assert seldom.true_limit == 10
+    assert str(seldom.runs[0].limits_on("true_episode_cost")) == "10"
 
 
 def test_what_a_task_declares_is_drawn():

@@ -40,7 +40,7 @@ function mount(figure) {
     seek.value = moment;
     view.classList.toggle("costs", data.cost[moment] > 0);
     status.textContent = `step ${data.step[moment]} of ${data.step[last]} · reward ${data.reward_sum[moment].toFixed(1)} · ` +
-      `cost ${round(data.cost_sum[moment])} (limit ${round(data.limit)})` + (data.cost[moment] > 0 ? " · costs now" : "");
+      `cost ${round(data.cost_sum[moment])} (limit ${data.limit})` + (data.cost[moment] > 0 ? " · costs now" : "");
     status.classList.toggle("costs", data.cost[moment] > 0);
     figure.dataset.drawn = moment;
   }
