@@ -67,8 +67,8 @@ def add(commands: Any) -> None:
 def run_render(arguments: argparse.Namespace) -> int:
     """Writes an episode as a film or a page."""
     with at_once():
-        from ..policies.load import trusting
         from ..render import film
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         film.render(
@@ -98,8 +98,9 @@ def run_plot(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     """Writes everything about runs on one page."""
     with at_once():
-        from ..policies.load import check_trusted, trusting
+        from ..policies.load import check_trusted
         from ..render import report
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         for folder in arguments.run_folders:

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..config.settings import convert
 from ..errors import UsageError
+from ..files import to_stderr
 from ..output import say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, limits, whole
 from .process import at_once
@@ -64,10 +65,11 @@ def run_eval(arguments: argparse.Namespace) -> int:
             why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
             raise UsageError(f"--{flag} {why}")
     from ..policies import evaluate
-    from ..policies.load import trusting
+    from ..trust import check_source, trusting
 
     episodes = arguments.episodes
     if arguments.policy:
+        check_source(arguments.source, ())
         options = dict(convert("env", arguments.env or ()))
         rows = [evaluate.evaluate_baseline(arguments.source, arguments.policy, episodes, options, arguments.save)]
         how = f"policy {arguments.policy}"
@@ -102,7 +104,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     """Writes a policy as files."""
     with at_once():
         from ..policies.export import export_policy
-        from ..policies.load import trusting
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
@@ -119,7 +121,11 @@ def run_hub(arguments: argparse.Namespace) -> int:
     say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
-        facts = hub.about(name)
+        try:
+            facts = hub.about(name)
+        except UsageError as error:  # the others are whole
+            to_stderr(f"left out: {error}")
+            continue
         (reward, rewards), (cost, costs) = (facts["figures"][f"episode_{what}"] for what in ("reward", "cost"))
         limit = f"limit {facts['cost_limit']:g}"
         say(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")

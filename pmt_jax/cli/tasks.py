@@ -9,6 +9,7 @@ from .. import tasks
 from ..config import toml
 from ..config.settings import load_config
 from ..output import say
+from ..trust import check_source
 from .parser import command, limits
 from .process import at_once
 
@@ -32,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _describe(name: str) -> int:
+    check_source(name, ())
     env = tasks.make(name)
     spec = env.spec
     actions = sorted({int(n) for n in spec.action_mask.sum(1)})

@@ -11,8 +11,9 @@ from typing import Any
 from ..config.settings import load_config
 from ..errors import UsageError
 from ..output import say
+from ..trust import check_source, trusting
 from .flags import add_settings, given
-from .parser import SOURCE, add_cache, add_devices, command, names, whole
+from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
 from .process import at_once
 
 
@@ -47,6 +48,7 @@ def add(commands: Any) -> None:
     )
     output.add_argument("--verbose", action="store_true", help="show what Warp prints about each of its kernels")
     add_cache(output)
+    add_trust(output)
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
     hosts.add_argument(
@@ -60,11 +62,17 @@ def add(commands: Any) -> None:
 @at_once()
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
+    with trusting(arguments.trust):
+        return _train(arguments)
+
+
+def _train(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
     if arguments.change and not arguments.resume:
         raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
+    check_source(arguments.source, [config.task])
     if arguments.verbose:
         logging.getLogger("envs").setLevel(logging.INFO)
     if sys.stdout.isatty():
