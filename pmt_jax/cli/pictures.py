@@ -6,6 +6,7 @@ import argparse
 import pathlib
 from typing import Any
 
+from .. import numerics
 from ..output import say
 from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, span, whole
 from .process import at_once
@@ -67,6 +68,7 @@ def add(commands: Any) -> None:
 def run_render(arguments: argparse.Namespace) -> int:
     """Writes an episode as a film or a page."""
     with at_once():
+        numerics.check()
         from ..render import film
         from ..trust import trusting
 
@@ -98,6 +100,7 @@ def run_plot(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     """Writes everything about runs on one page."""
     with at_once():
+        numerics.check()
         from ..policies.load import check_trusted
         from ..render import report
         from ..trust import trusting

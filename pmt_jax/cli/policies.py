@@ -7,6 +7,7 @@ import math
 import pathlib
 from typing import Any
 
+from .. import numerics
 from ..config.settings import convert
 from ..errors import UsageError
 from ..files import to_stderr
@@ -64,6 +65,7 @@ def run_eval(arguments: argparse.Namespace) -> int:
         if getattr(arguments, flag) is not None:
             why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
             raise UsageError(f"--{flag} {why}")
+    numerics.check()
     from ..policies import evaluate
     from ..trust import check_source, trusting
 
@@ -103,6 +105,7 @@ def _say_row(row: dict[str, Any]) -> None:
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes a policy as files."""
     with at_once():
+        numerics.check()
         from ..policies.export import export_policy
         from ..trust import trusting
 

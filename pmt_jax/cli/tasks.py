@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .. import tasks
+from .. import numerics, tasks
 from ..config import toml
 from ..config.settings import load_config
 from ..output import say
@@ -34,6 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _describe(name: str) -> int:
     check_source(name, ())
+    numerics.check()
     env = tasks.make(name)
     spec = env.spec
     actions = sorted({int(n) for n in spec.action_mask.sum(1)})

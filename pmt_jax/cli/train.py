@@ -8,13 +8,14 @@ import pathlib
 import sys
 from typing import Any
 
+from .. import numerics
 from ..config.settings import load_config
 from ..errors import UsageError
 from ..output import say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
 from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
-from .process import at_once
+from .process import at_once, check_system
 
 
 def add(commands: Any) -> None:
@@ -77,10 +78,13 @@ def _train(arguments: argparse.Namespace) -> int:
         logging.getLogger("envs").setLevel(logging.INFO)
     if sys.stdout.isatty():
         say("loading JAX and the task ...")  # ten seconds with Warp
+    check_system()
+    numerics.check_settings()
     from ..policies import warm_start
     from ..training import processes, trainer
 
     processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
+    numerics.check_devices()
     return trainer.train(
         config,
         arguments.out,

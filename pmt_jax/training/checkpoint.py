@@ -58,12 +58,23 @@ def unpack(packed: dict[str, np.ndarray], like: Any) -> Any:
         if path not in packed:
             return jnp.zeros(x.shape, x.dtype)
         data = jnp.asarray(packed[path])
-        value = jax.random.wrap_key_data(data) if _is_key(x) else data
+        value = _as_key(data) if _is_key(x) else data
         if (value.shape, value.dtype) != (x.shape, x.dtype):
             raise UsageError(f"the checkpoint's {path} is {value.dtype}{value.shape}, expected {x.dtype}{x.shape}")
         return value
 
     return treedef.unflatten([restore(path, x) for path, x in expected.items()])
+
+
+def _as_key(data: jax.Array) -> jax.Array:
+    """Random keys from their numbers, of the kind that this process draws with."""
+    try:
+        return jax.random.wrap_key_data(data)
+    except TypeError:
+        raise UsageError(
+            "the checkpoint's random keys are of another kind than those of this process; set JAX_DEFAULT_PRNG_IMPL to "
+            "what the run was trained with"
+        ) from None
 
 
 def _is_key(x: Any) -> bool:

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import numerics
 from ..config.settings import Config, differences, load_config, to_toml
 from ..errors import UsageError
 from ..files import read_rows, replace_text
@@ -120,10 +121,9 @@ def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> No
 
 
 def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
-    """Refuses another engine, which computes another run; says which versions changed, which costs the last bits."""
-    try:
-        old = dict(json.loads((out / "versions.json").read_text()))
-    except (OSError, ValueError, TypeError):
+    """Refuses another engine or other random numbers; says which versions changed, which costs the last bits."""
+    old = _recorded_versions(out)
+    if old is None:
         say(f"{out / 'versions.json'} cannot be read: the engine and the versions of the run are unknown")
         return
     new = versions(setup)
@@ -133,9 +133,19 @@ def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
             f"'{new['engine']}' on this {new['device']}, whose numbers differ; resume it where '{old['engine']}' runs, "
             "or choose another --out"
         )
-    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    plain = [name for name in new if name in old and not isinstance(new[name], dict)]
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in plain if old[name] != new[name]]
+    changed += numerics.changes(old, new, out)
     if changed:
         say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
+
+
+def _recorded_versions(out: pathlib.Path) -> dict[str, Any] | None:
+    """What versions.json holds; None if it cannot be read."""
+    try:
+        return dict(json.loads((out / "versions.json").read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
 
 
 def versions(setup: Setup) -> dict[str, Any]:
@@ -143,7 +153,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1, "jobs": setup.jobs}
-    return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
+    return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 
 def write_settings(out: pathlib.Path, setup: Setup) -> None:
@@ -233,10 +243,11 @@ def load_saved(
         raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
-    like = state_like(setup)
     checkpoints = Checkpoints(folder, read_only=True)
     try:
-        step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
+        with numerics.keys_of(_recorded_versions(folder) or {}):
+            like = state_like(setup)
+            step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
     finally:
         checkpoints.close()
     return setup, step, saved
