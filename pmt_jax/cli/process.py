@@ -34,6 +34,10 @@ def answer(name: str, command: Callable[[], int]) -> int:
         return 141
     except OSError as error:  # a path that is too long, a folder that may not be read, a full disk
         return _refuse(name, f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+    except UnicodeError as error:
+        if sys.getfilesystemencoding() == "utf-8":
+            raise
+        return _refuse(name, f"the locale has another encoding than UTF-8 ({error.args[0]}); set PYTHONUTF8=1")
     except ValueError as error:
         if not numerics.is_bad_variable(error):
             raise

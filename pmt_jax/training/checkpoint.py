@@ -103,6 +103,21 @@ def has_checkpoint(folder: pathlib.Path) -> bool:
     return processes.by_first(lambda: any(path.name.isdigit() for path in (folder / "checkpoints").glob("*")))
 
 
+def check_name(folder: pathlib.Path) -> None:
+    """Refuses a folder whose path cannot be encoded in UTF-8: orbax would end in a traceback.
+
+    Raises:
+      UsageError: it cannot.
+    """
+    try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError:
+        raise UsageError(
+            f"the path {folder} is not UTF-8, which checkpoints need; rename the folder, or set PYTHONUTF8=1 if the "
+            "locale has another encoding"
+        ) from None
+
+
 class Checkpoints:
     """The checkpoints of a run folder, named by their step; the newest `KEEP` are kept.
 
@@ -111,6 +126,7 @@ class Checkpoints:
 
     def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
         """Opens the checkpoints of `folder`; `read_only` changes nothing on disk."""
+        check_name(folder)
         self._folder = (folder / "checkpoints").absolute()
         self._manager: Any = None
         processes.by_first(lambda: self._open(read_only))

@@ -25,7 +25,7 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from .checkpoint import Checkpoints
+from .checkpoint import Checkpoints, check_name
 from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -55,8 +55,9 @@ def check_out(out: pathlib.Path, resume: bool) -> None:
     """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
 
     Raises:
-      UsageError: it is a file, or holds no run to resume.
+      UsageError: it is a file, has a name that cannot be encoded, or holds no run to resume.
     """
+    check_name(out)
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, not a folder; choose another --out")
     if resume and not (out / "config.toml").is_file():
@@ -195,7 +196,7 @@ def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
 
 
 def _check_number(metrics: pathlib.Path, row: Row, name: str) -> None:
-    if not isinstance(row.get(name), int | float) or isinstance(row[name], bool):
+    if not isinstance(row.get(name), int | float) or isinstance(row[name], bool) or not abs(row[name]) < 2**63:
         raise UsageError(
             f"{metrics} holds a row with {name} = {json.dumps(row.get(name))}, where a number was expected; delete "
             "that line and --resume again"
