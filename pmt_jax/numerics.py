@@ -60,6 +60,10 @@ REFUSED: dict[str, tuple[Callable[[Any], bool], str]] = {  # when it is refused,
         f"jax_transfer_guard{which}": (lambda x: str(x).startswith("disallow"), _HIDDEN)
         for which in ("", "_host_to_device", "_device_to_host", "_device_to_device")
     },
+    **{
+        f"jax_error_checking_behavior_{which}": (lambda x: x == "raise", "its checks do not go with vmap")
+        for which in ("nan", "oob", "divide")
+    },
 }
 
 HARMLESS = re.compile(  # where programs run, what is logged, kept or shown; no number depends on it

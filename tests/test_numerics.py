@@ -34,6 +34,9 @@ BAD = {
     "jax_transfer_guard_host_to_device": "disallow_explicit",
     "jax_transfer_guard_device_to_host": "disallow",
     "jax_transfer_guard_device_to_device": "disallow",
+    "jax_error_checking_behavior_nan": "raise",
+    "jax_error_checking_behavior_oob": "raise",
+    "jax_error_checking_behavior_divide": "raise",
 }
 BAD = {name: value for name, value in BAD.items() if name in jax.config.values}  # some come and go with JAX's versions
 COMMANDS = (
