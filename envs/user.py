@@ -34,6 +34,11 @@ def is_file(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
+def file_of(name: str) -> pathlib.Path:
+    """The Python file that `name` means, as a whole path; links are not followed."""
+    return _split(name)[0]
+
+
 def _split(name: str) -> tuple[pathlib.Path, str | None]:
     match = _NAME.fullmatch(name)
     assert match is not None, name  # callers check `is_file` first

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 ROUNDING = 1e-6  # share of a limit: costs are rounded to 32 bits, and a cost that is its limit is within it
 WORST = "_worst"  # behind the name of a cost: that of the agent whose is highest
 KEY = "cost_limit"
+LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +62,8 @@ class Limits:
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Limits:
         """Those of a row of metrics.jsonl or of an evaluation."""
-        return cls(tuple(x for name, x in row.items() if name.startswith(f"{KEY}/")) or (row[KEY],))
+        each = tuple(x for name, x in row.items() if name.startswith(f"{KEY}/")) or (row[KEY],)
+        return cls(tuple(math.inf if d > LARGEST else d for d in each))  # to training, in 32 bits, it was none
 
     @property
     def columns(self) -> dict[str, float]:

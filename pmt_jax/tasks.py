@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pathlib
 import types
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -37,6 +38,7 @@ __all__ = [
     "names",
     "options",
     "shares_cost",
+    "task_file",
 ]
 
 
@@ -71,6 +73,11 @@ def names() -> list[str]:
 def is_file(name: str) -> bool:
     """Whether a task's name means a Python file of the user's (`my_env.py`, `my_env.py:Name`)."""
     return _envs().user.is_file(name)
+
+
+def task_file(name: str) -> pathlib.Path:
+    """The Python file that a task's name means (see `is_file`), as a whole path; links are not followed."""
+    return _envs().user.file_of(name)
 
 
 def absolute(name: str) -> str:

@@ -39,6 +39,14 @@ for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the 
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def state_of_the_user(tmp_path_factory: pytest.TempPathFactory):
+    """What `pmt` remembers for its user goes into a folder of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture
 def cli(capsys: pytest.CaptureFixture[str]):
     """Runs a command line in this process: (exit code, stdout, stderr)."""

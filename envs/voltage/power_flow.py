@@ -453,12 +453,16 @@ def radial_network(
       base_mva: power base.
       inject: as in `load_network`.
     """
-    parent = np.asarray(parent)
+    parent, r, x = (np.asarray(value) for value in (parent, r, x))
+    if not parent.shape == r.shape == x.shape == (parent.size,):
+        raise TaskError(
+            f"a radial network has a parent, r and x for each bus, not {parent.size}, {r.size} and {x.size}"
+        )
     if np.count_nonzero(parent < 0) != 1:
         raise TaskError(f"a radial network has one bus without parent, this one has {np.count_nonzero(parent < 0)}")
     slack = int(np.flatnonzero(parent < 0)[0])
     child = np.flatnonzero(parent >= 0)
-    branches = [Branch(int(parent[i]), int(i), float(np.asarray(r)[i]), float(np.asarray(x)[i])) for i in child]
+    branches = [Branch(int(parent[i]), int(i), float(r[i]), float(x[i])) for i in child]
     return branch_network(len(parent), branches, base_mva, slack=slack, inject=inject, name=name)
 
 
@@ -506,17 +510,22 @@ def branch_network(
       inject: as in `load_network`.
 
     Raises:
-      TaskError: a bus that no branch reaches, a branch without impedance, an index out of range.
+      TaskError: a bus that no branch reaches, a branch without impedance, an index out of range, a number that is not
+        finite or has a sign that it cannot have, or branches that cancel.
     """
     z: Any
     half: Any
     f, t, z, half, ratio = _branch_arrays(n_bus, branches, name)
     shunts = np.zeros(n_bus, complex) if shunt is None else np.asarray(shunt, complex)
+    _check_numbers(n_bus, branches, base_mva, (slack, slack_vm, slack_va), shunts, name)
     to_series, y_bus = _admittance(n_bus, f, t, 1 / z, half, ratio, shunts)
     _check_connected(n_bus, f, t, slack, name)
     where = np.setdiff1d(np.arange(n_bus), [slack]) if inject is None else _injection_buses(inject, n_bus, slack)
     slack_v = slack_vm * np.exp(1j * slack_va)
-    z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v)
+    try:
+        z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v)
+    except np.linalg.LinAlgError:
+        raise TaskError(f"network '{name}': its admittances cancel, so voltages do not follow from currents") from None
     series = to_series @ z_all[:, where]
     series_0 = to_series @ v_0
     feed, feed_0 = y_bus[slack] @ z_all[:, where], y_bus[slack] @ v_0
@@ -554,6 +563,33 @@ def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex) -> tupl
     v_0 = -z_all @ y_bus[:, slack] * slack_v
     v_0[slack] = slack_v
     return z_all, v_0
+
+
+def _check_numbers(
+    n_bus: int,
+    branches: Sequence[Branch],
+    base_mva: float,
+    slack: tuple[int, float, float],
+    shunts: np.ndarray,
+    name: str,
+) -> None:
+    """Raises TaskError for numbers that no network has; r of a transformer, as a part of a star, may be below 0."""
+    bus, vm, va = slack
+    if not (np.isfinite(base_mva) and base_mva > 0):
+        raise TaskError(f"network '{name}': base_mva = {base_mva} must be above 0")
+    if not 0 <= bus < n_bus:
+        raise TaskError(f"network '{name}': the slack bus {bus} is not among 0 to {n_bus - 1}")
+    if not (np.isfinite([vm, va]).all() and vm > 0):
+        raise TaskError(f"network '{name}': the slack's voltage {vm} p.u. at {va} rad must be finite and above 0")
+    if shunts.shape != (n_bus,) or not np.isfinite(shunts).all():
+        raise TaskError(f"network '{name}': shunt needs a finite admittance for each of {n_bus} buses")
+    for i, branch in enumerate(branches):
+        if not np.isfinite(branch).all():
+            raise TaskError(f"network '{name}': branch {i} has a number that is not finite: {branch}")
+        if branch.tap <= 0:
+            raise TaskError(f"network '{name}': branch {i} has a tap of {branch.tap}; it must be above 0")
+        if branch.is_line and branch.r < 0:
+            raise TaskError(f"network '{name}': branch {i} is a line of negative resistance, r = {branch.r}")
 
 
 def _branch_arrays(n_bus: int, branches: Sequence[Branch], name: str) -> tuple[np.ndarray, ...]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import lzma
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -115,12 +116,22 @@ def _from_disk(path: Path, num_loads: int, num_pvs: int) -> Profiles:
     if path.is_dir():
         return load_folder(path, num_loads, num_pvs)
     if path.suffix == ".npz" and path.is_file():
+        return _from_npz(path)
+    raise TaskError(f"data '{path}' is neither 'simbench', 'synthetic', a folder with {', '.join(FILES)}, nor an npz")
+
+
+def _from_npz(path: Path) -> Profiles:
+    try:
         with np.load(path) as file:
             if missing := {"pv", "p_load", "q_load", "rows_per_knot"} - set(file.files):
                 raise TaskError(f"{path} was not written by save_profiles; it lacks {', '.join(sorted(missing))}")
-            arrays = {key: file[key] for key in ("pv", "p_load", "q_load")}
-            return Profiles(**arrays, rows_per_knot=int(file["rows_per_knot"]), source=str(path))
-    raise TaskError(f"data '{path}' is neither 'simbench', 'synthetic', a folder with {', '.join(FILES)}, nor an npz")
+            arrays = {key: file[key].astype(float) for key in ("pv", "p_load", "q_load")}
+            rows_per_knot = int(file["rows_per_knot"])
+    except TaskError:
+        raise
+    except (ValueError, TypeError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise TaskError(f"{path} cannot be read: {error}") from None
+    return Profiles(**arrays, rows_per_knot=rows_per_knot, source=str(path))
 
 
 # MAPDN's folder
@@ -157,8 +168,11 @@ def _read_csv(path: Path, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """[rows, columns] values and [rows] times of one file."""
     if not path.is_file():
         raise TaskError(f"{path} is missing; a data folder holds {', '.join(FILES)}")
-    with path.open(encoding="utf-8-sig") as file:
-        header = file.readline().rstrip("\n").split(",")
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            header = file.readline().rstrip("\n").split(",")
+    except UnicodeDecodeError:
+        raise TaskError(f"{path} is not a text of comma-separated values") from None
     if len(header) != columns + 1:
         raise TaskError(f"{path} has {len(header)} columns, expected a time and {columns} values")
     try:
@@ -198,9 +212,11 @@ def _check_times(path: Path, times: np.ndarray) -> None:
 
 
 def _check_units(path: Path, profiles: Profiles) -> None:
-    """Refuses what can only be kW, or generation written as negative."""
+    """Refuses what can only be kW, and generation or consumption written as negative."""
     if profiles.pv.min() < -1e-6:
         raise TaskError(f"{path / FILES[2]}: PV power is {profiles.pv.min():g}, generation must not be negative")
+    if profiles.p_load.min() < -1e-6:
+        raise TaskError(f"{path / FILES[0]}: a load is {profiles.p_load.min():g}, consumption must not be negative")
     largest = max(np.abs(x).max() for x in (profiles.pv, profiles.p_load, profiles.q_load))
     if largest > 200:
         raise TaskError(f"{path}: the largest value is {largest:g}; MW and MVAr are expected, this looks like kW")

@@ -11,13 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import pmt_jax
 
-from .. import tasks
+from .. import numerics, tasks
 from ..errors import UsageError
 from ..output import say
 from ..probe import run_python
 from ..render import gl
 from .parser import command
-from .process import at_once
+from .process import at_once, system_obstacle
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 EXTRAS = {  # which of our extras brings an optional package
@@ -84,10 +84,10 @@ def examine() -> Iterator[Finding]:
     for name, version in found.items():
         missing = "missing; reinstall with pip install pmt-jax"
         yield Finding("ok", name, version) if version else Finding("bad", name, missing)
+    if obstacle := system_obstacle():
+        yield Finding("bad", "operating system", obstacle)
     if found["jax"] and found["jaxlib"]:
-        yield _devices()
-        yield from _engines()
-        yield _cache()
+        yield from _computing()
     yield from _rendering()
     for name, extra in EXTRAS.items():
         version = tasks.installed_version(name)
@@ -95,15 +95,26 @@ def examine() -> Iterator[Finding]:
         yield Finding("ok", name, version) if version else absent
 
 
+def _computing() -> Iterator[Finding]:
+    """What JAX can use, as far as its settings let it start."""
+    try:
+        numerics.check_settings()
+    except (UsageError, ValueError) as error:  # ValueError: of JAX itself, about a variable
+        yield Finding("bad", "settings of JAX", str(error).splitlines()[0])
+        return
+    yield _devices()
+    yield from _engines()
+    yield _cache()
+
+
 def _devices() -> Finding:
+    if obstacle := numerics.device_obstacle():
+        return Finding("bad", "devices", obstacle)
     import jax
 
     from ..training.processes import usable_cpus
 
-    try:
-        devices = jax.devices()
-    except RuntimeError as error:
-        return Finding("bad", "devices", f"JAX finds none: {str(error).splitlines()[0]}")
+    devices = jax.devices()
     kinds = ", ".join(f"{d.device_kind} ({d.platform})" for d in devices)
     return Finding("ok", "devices", f"{kinds}; {usable_cpus()} CPUs usable")
 

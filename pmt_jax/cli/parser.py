@@ -152,7 +152,8 @@ def add_trust(parser: Any) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="execute the Python file of the run's task, although it is not in the working folder",
+        help="execute the Python file that a run or a file of settings names, although you have not trained with it; "
+        "remembered until that file changes",
     )
 
 

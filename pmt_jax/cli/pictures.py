@@ -6,6 +6,7 @@ import argparse
 import pathlib
 from typing import Any
 
+from .. import numerics
 from ..output import say
 from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, span, whole
 from .process import at_once
@@ -67,8 +68,9 @@ def add(commands: Any) -> None:
 def run_render(arguments: argparse.Namespace) -> int:
     """Writes an episode as a film or a page."""
     with at_once():
-        from ..policies.load import trusting
+        numerics.check()
         from ..render import film
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         film.render(
@@ -98,8 +100,10 @@ def run_plot(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     """Writes everything about runs on one page."""
     with at_once():
-        from ..policies.load import check_trusted, trusting
+        numerics.check()
+        from ..policies.load import check_trusted
         from ..render import report
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         for folder in arguments.run_folders:

@@ -7,8 +7,10 @@ import math
 import pathlib
 from typing import Any
 
+from .. import numerics
 from ..config.load import convert
 from ..errors import UsageError
+from ..files import to_stderr
 from ..output import say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, whole
 from .process import at_once
@@ -63,11 +65,13 @@ def run_eval(arguments: argparse.Namespace) -> int:
         if getattr(arguments, flag) is not None:
             why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
             raise UsageError(f"--{flag} {why}")
+    numerics.check()
     from ..policies import evaluate
-    from ..policies.load import trusting
+    from ..trust import check_source, trusting
 
     episodes = arguments.episodes
     if arguments.policy:
+        check_source(arguments.source, ())
         options = dict(convert("env", arguments.env or ()))
         rows = [evaluate.evaluate_baseline(arguments.source, arguments.policy, episodes, options, arguments.save)]
         how = f"policy {arguments.policy}"
@@ -103,8 +107,9 @@ def _say_row(row: dict[str, Any]) -> None:
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes a policy as files."""
     with at_once():
+        numerics.check()
         from ..policies.export import export_policy
-        from ..policies.load import trusting
+        from ..trust import trusting
 
     with trusting(arguments.trust):
         export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
@@ -122,7 +127,11 @@ def run_hub(arguments: argparse.Namespace) -> int:
     say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
-        facts = hub.about(name)
+        try:
+            facts = hub.about(name)
+        except UsageError as error:  # the others are whole
+            to_stderr(f"left out: {error}")
+            continue
         figures, limit = facts["figures"], f"limit {facts['cost_limit']:g}"
         reward, rewards = figures["episode_reward"]
         cost, costs = figures.get(f"episode_cost{WORST}", figures["episode_cost"])

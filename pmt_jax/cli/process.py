@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+from .. import numerics
 from ..errors import UsageError
 
 
@@ -33,6 +34,14 @@ def answer(name: str, command: Callable[[], int]) -> int:
         return 141
     except OSError as error:  # a path that is too long, a folder that may not be read, a full disk
         return _refuse(name, f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+    except UnicodeError as error:
+        if sys.getfilesystemencoding() == "utf-8":
+            raise
+        return _refuse(name, f"the locale has another encoding than UTF-8 ({error.args[0]}); set PYTHONUTF8=1")
+    except ValueError as error:
+        if not numerics.is_bad_variable(error):
+            raise
+        return _refuse(name, f"JAX cannot start: {str(error).splitlines()[0]}; correct or unset that variable")
     except RuntimeError as error:
         if not _is_out_of_memory(error):
             raise
@@ -76,6 +85,25 @@ def at_once() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def system_obstacle() -> str | None:
+    """Why no run can be trained on this operating system, in a sentence; None if it can."""
+    try:
+        import fcntl
+    except ImportError:
+        return (
+            "this system has no file locks (Python's fcntl), without which two processes could train in one folder; "
+            "train on Linux or macOS, or on Windows in WSL"
+        )
+    del fcntl
+    return None
+
+
+def check_system() -> None:
+    """Raises UsageError where no run can be trained on this operating system."""
+    if found := system_obstacle():
+        raise UsageError(found)
+
+
 def refuse_many(command: str, jobs: int, devices: int | None) -> None:
     """Refuses to run once in each of several processes, which would write into the same folders."""
     from ..studies.workers import share_memory
@@ -84,5 +112,7 @@ def refuse_many(command: str, jobs: int, devices: int | None) -> None:
     processes.make_room(devices)
     if jobs > 1:
         share_memory()
+    check_system()
+    numerics.check()
     if processes.in_step():
         raise UsageError(f"{command} runs in one process; start it without srun, or with srun --ntasks=1")

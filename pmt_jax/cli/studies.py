@@ -8,8 +8,9 @@ from typing import Any
 
 from ..errors import UsageError
 from ..output import say
+from ..trust import check_source, trusting
 from .flags import add_settings, given
-from .parser import SOURCE, add_format, add_jobs, command, whole
+from .parser import SOURCE, add_format, add_jobs, add_trust, command, whole
 from .process import at_once, refuse_many
 
 
@@ -45,6 +46,7 @@ def _add_sweep(commands: Any) -> None:
     sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="seed of these draws (default 0)")
     sweep.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR", help="gets a run folder per point")
     add_jobs(sweep)
+    add_trust(sweep)
     add_settings(sweep)
 
 
@@ -121,9 +123,14 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)
     points = make_points(parts, arguments.preset, **given(arguments))
     refuse_many("pmt sweep", arguments.jobs, arguments.devices)
+    from ..policies.load import check_trusted
     from ..studies import sweep
 
-    return sweep.sweep(parts, points, arguments.out, _launch(arguments))
+    with trusting(arguments.trust):
+        check_source(source, [config.task for config in points.values()])
+        for run in {run for config in points.values() for run in (config.init, config.init_fear) if run}:
+            check_trusted(pathlib.Path(run))  # here, because worker processes do not ask again
+        return sweep.sweep(parts, points, arguments.out, _launch(arguments))
 
 
 def _launch(arguments: argparse.Namespace) -> Any:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .. import tasks
+from .. import numerics, tasks
 from ..config import load
 from ..config.load import load_config
 from ..output import say
+from ..trust import check_source
 from .parser import command
 from .process import at_once
 
@@ -34,6 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _describe(name: str) -> int:
     from ..limits import Limits
 
+    check_source(name, ())
+    numerics.check()
     env = tasks.make(name)
     spec = env.spec
     actions = sorted({int(n) for n in spec.action_mask.sum(1)})

@@ -8,12 +8,14 @@ import pathlib
 import sys
 from typing import Any
 
+from .. import numerics
 from ..config.load import load_config
 from ..errors import UsageError
 from ..output import say
+from ..trust import check_source, trusting
 from .flags import add_settings, given
-from .parser import SOURCE, add_cache, add_devices, command, names, whole
-from .process import at_once
+from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
+from .process import at_once, check_system
 
 
 def add(commands: Any) -> None:
@@ -47,6 +49,7 @@ def add(commands: Any) -> None:
     )
     output.add_argument("--verbose", action="store_true", help="show what Warp prints about each of its kernels")
     add_cache(output)
+    add_trust(output)
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
     hosts.add_argument(
@@ -60,19 +63,28 @@ def add(commands: Any) -> None:
 @at_once()
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
+    with trusting(arguments.trust):
+        return _train(arguments)
+
+
+def _train(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
     if arguments.resume and arguments.out is None:
         raise UsageError("--resume needs --out, the folder of the run to continue")
     if arguments.change and not arguments.resume:
         raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
+    check_source(arguments.source, [config.task])
     if arguments.verbose:
         logging.getLogger("envs").setLevel(logging.INFO)
     if sys.stdout.isatty():
         say("loading JAX and the task ...")  # ten seconds with Warp
+    check_system()
+    numerics.check_settings()
     from ..policies import warm_start
     from ..training import processes, trainer
 
     processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
+    numerics.check_devices()
     return trainer.train(
         config,
         arguments.out,

@@ -11,6 +11,7 @@ import threading
 from ..output import say
 from ..studies import sweep
 from ..training import processes
+from ..trust import trusting
 from .process import answer
 
 
@@ -28,7 +29,8 @@ def main() -> int:
     def train() -> int:
         devices = int(count) if count else None
         processes.make_room(devices)
-        return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
+        with trusting():  # whoever started this process has checked what its settings name
+            return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)
 
     return answer("pmt", train)
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import tasks
+from .. import numerics, tasks
 from ..config.methods import METHODS, Method
 from ..config.settings import HYPER_FIELDS, Config, Hyper
 from ..errors import UsageError
@@ -107,8 +107,11 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
       env: an environment of your own, in place of `config.task`.
 
     Raises:
-      UsageError: unknown task or task option, an engine that cannot run here, or an `env` that breaks the contract.
+      UsageError: unknown task or task option, an engine that cannot run here, an `env` that breaks the contract, or a
+        setting of JAX that no program runs with.
     """
+    if found := numerics.obstacle():
+        raise UsageError(found)
     method = METHODS[config.method]
     if env is None:
         env = tasks.make(config.task, config.physics, **_options(config))

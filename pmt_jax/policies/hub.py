@@ -1,11 +1,13 @@
 """Trained policies that come with the package, one a task and method, under names like `hub:ant_2x4/r4sg`.
 
 Each is a small npz: the run's settings, the part of its best seed's learner state that acts, and its evaluation.
-Kernels are 8-bit integers with a scale per output, the rest is stored as it is: docs/howto/pretrained.md has the error.
+SHA256SUMS beside them has the checksum of each, as `sha256sum` writes it. Kernels are 8-bit integers with a scale per
+output, the rest is stored as it is: docs/howto/pretrained.md has the error.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import pathlib
 import tomllib
@@ -26,6 +28,7 @@ from ..tasks import did_you_mean
 from ..training import checkpoint
 
 FOLDER = pathlib.Path(__file__).parent / "pretrained"
+CHECKSUMS = "SHA256SUMS"
 PREFIX = "hub:"
 LEVELS = 127  # of an 8-bit integer, on either side of 0
 NOTHING = np.float32(1e-30)  # a weight so small is none
@@ -38,8 +41,9 @@ def is_name(source: str | pathlib.Path) -> bool:
 
 
 def names() -> list[str]:
-    """All pretrained policies."""
-    return sorted(PREFIX + file.stem.replace("-", "/") for file in FOLDER.glob("*.npz"))
+    """All pretrained policies, those whose file is damaged or lost included."""
+    files = {file.name for file in FOLDER.glob("*.npz")} | _checksums().keys()
+    return sorted(PREFIX + file.removesuffix(".npz").replace("-", "/") for file in files)
 
 
 def file_of(name: str) -> pathlib.Path:
@@ -51,7 +55,7 @@ def about(name: str) -> dict[str, Any]:
     """The description of a policy: its evaluation, its origin, the error of packing (see docs/howto/pretrained.md).
 
     Raises:
-      UsageError: there is no such policy.
+      UsageError: there is no such policy, or its file is damaged.
     """
     return json.loads(str(_read(name)["about"]))
 
@@ -63,7 +67,7 @@ def load(name: str, physics: str | None = None) -> tuple[Setup, ActingState]:
       physics: the engine to simulate with, in place of the fastest for the device.
 
     Raises:
-      UsageError: there is no such policy, or the engine cannot run here.
+      UsageError: there is no such policy, its file is damaged, or the engine cannot run here.
     """
     table = _read(name)
     config = load_config(tomllib.loads(str(table.pop("config"))))
@@ -106,13 +110,36 @@ def rounded(state: ActingState) -> ActingState:
 def _write(name: str, table: dict[str, np.ndarray]) -> None:
     with writing(file_of(name)) as partial:
         np.savez_compressed(partial, **table)  # pyright: ignore[reportArgumentType] (its stub)
+        checksum = _checksum(partial)
+    sums = _checksums() | {file_of(name).name: checksum}
+    with writing(FOLDER / CHECKSUMS) as partial:
+        partial.write_text("".join(f"{sums[file]}  {file}\n" for file in sorted(sums)))
 
 
 def _read(name: str) -> dict[str, np.ndarray]:
     if name not in names():
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, names())} (pmt hub lists all)")
-    with np.load(file_of(name)) as file:
-        return dict(file)
+    file = file_of(name)
+    if _checksums().get(file.name, "none") != _checksum(file):
+        raise UsageError(
+            f"{name} is damaged: {file} is missing or not as {CHECKSUMS} beside it lists it; install pmt-jax anew"
+        )
+    with np.load(file) as table:
+        return dict(table)
+
+
+def _checksums() -> dict[str, str]:
+    """The files that belong to the package, and their checksums."""
+    file = FOLDER / CHECKSUMS
+    lines = file.read_text(errors="replace").splitlines() if file.is_file() else []
+    return {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
+
+
+def _checksum(file: pathlib.Path) -> str:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return "unreadable"
 
 
 def _narrowed(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

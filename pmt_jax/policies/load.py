@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import contextvars
 import pathlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,44 +13,24 @@ from ..config.load import load_config
 from ..errors import UsageError
 from ..learning.setup import Setup
 from ..learning.types import ActingState
-from ..tasks import did_you_mean, is_file
+from ..tasks import did_you_mean
 from ..training.run_folder import MATMUL_PRECISION, load_saved
+from ..trust import check, trusting
 from . import hub
 
 WHICH = ("last", "best")
 
 Policy = Callable[[jax.Array], jax.Array]
 
-_trusts = contextvars.ContextVar("trusts", default=False)
-
-
-@contextlib.contextmanager
-def trusting(trust: bool = True) -> Iterator[None]:
-    """Inside, runs of tasks that are Python files from elsewhere may be loaded, which executes the files."""
-    token = _trusts.set(trust or _trusts.get())
-    try:
-        yield
-    finally:
-        _trusts.reset(token)
-
 
 def check_trusted(folder: pathlib.Path) -> None:
-    """Refuses a run whose task is a Python file from elsewhere.
+    """Refuses a run whose task is a Python file that this user has neither trained with nor said to trust.
 
     Raises:
-      UsageError: loading the run would execute a file that lies outside of the working folder, or in the run folder.
+      UsageError: loading the run would execute that file, or one in the run folder.
     """
-    if _trusts.get() or hub.is_name(folder) or not (folder / "config.toml").is_file():
-        return
-    task = load_config(folder / "config.toml").task
-    if not is_file(task):
-        return
-    file = pathlib.Path(task.rpartition(".py")[0] + ".py").resolve()
-    if not file.is_relative_to(pathlib.Path.cwd().resolve()) or file.is_relative_to(folder.resolve()):
-        raise UsageError(
-            f"{folder} is a run of {file}, whose code would be executed, and which is not a file of your working "
-            "folder; add --trust (in Python: trust=True) if you trust it"
-        )
+    if not hub.is_name(folder) and (folder / "config.toml").is_file():
+        check(load_config(folder / "config.toml").task, f"{folder} is a run of", folder)
 
 
 def load_run(
@@ -92,7 +70,7 @@ def load_policy(
       folder: the run folder, which is only read, or the name of a pretrained policy: `hub:ant_2x4/r4sg`.
       seed: one of the run's seeds; its first if None.
       which: `last`, or `best`: the seed's own best (see docs/howto/evaluate.md).
-      trust: execute the task's Python file even if it comes from elsewhere.
+      trust: execute the task's Python file even if you have not trained with it, and remember it.
 
     Returns:
       policy: raw observations obs [N, O] -> mean action [N, A], 0 where an agent has no such entry. Observations are

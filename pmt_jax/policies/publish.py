@@ -27,7 +27,7 @@ from ..training.metrics import judged_cost
 from ..training.run_folder import load_saved
 from . import hub
 from .evaluate import evaluate_states
-from .load import WHICH
+from .load import WHICH, check_trusted
 
 
 def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
@@ -78,6 +78,7 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     Returns:
       the run, `last` or `best`, the seed's row of `evaluate_run`, and what acts, with a leading [1].
     """
+    check_trusted(folder)
     run, _, saved = load_saved(folder, "auto")
     states = [saved["last"], saved["best"].state]
     acting = [ActingState(TrainState(state.actor.params, None), state.obs_moments, state.update) for state in states]

@@ -167,6 +167,9 @@ def draw(shown: Sequence[Group], out: pathlib.Path) -> None:
     from matplotlib.figure import Figure
 
     tasks = {task: [g for g in shown if g.task == task] for task in dict.fromkeys(g.task for g in shown)}
+    for task, runs in tasks.items():
+        if not panels(runs, titles(runs) | EMOTIONS):
+            raise UsageError(f"there is nothing to draw of {task}: no metric of its runs is a finite number anywhere")
     sizes = [_size(groups) for groups in tasks.values()]
     wide = max(width for width, _ in sizes)
     with rc_context({"font.size": 9, "svg.fonttype": "none", "text.parse_math": False}), writing(out) as partial:

@@ -25,6 +25,7 @@ LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
 IDENTITY = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
 TEXT = ("broken",)  # besides
+LARGEST = float(np.finfo(np.float32).max)  # training computes in 32 bits, so larger numbers are no run's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -269,8 +270,11 @@ def _check(row: dict[str, Any], file: pathlib.Path) -> None:
     """Raises UsageError if a row's identity is missing or of the wrong type."""
     for name, kind in IDENTITY.items():
         value = row.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float if kind is float else kind):
-            words = {int: "a whole number", str: "a word", float: "a number"}[kind]
+        words = {int: "a whole number", str: "a word", float: "a number"}[kind]
+        fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
+        if fits and isinstance(value, int) and not 0 <= value < 2**63:
+            fits, words = False, f"{words} from 0 to 2**63"
+        if not fits:
             raise UsageError(f"{file}: a row has {name} = {json.dumps(value)[:40]}, where {words} belongs")
 
 
@@ -288,10 +292,14 @@ def _metrics(
             if name not in found:
                 found[name] = np.full((len(seeds), len(steps)), np.nan)
             try:
-                found[name][place] = math.nan if value is None else value
+                number = math.nan if value is None else float(value)
             except (TypeError, ValueError, OverflowError):
+                number = None
+            if number is None or LARGEST < abs(number) < math.inf:
+                words = "a number or null" if number is None else "a number of 32 bits or null"
                 where = f"{name} = {json.dumps(value)[:40]} at step {row['step']}"
-                raise UsageError(f"{file}: a row has {where}, where a number or null belongs") from None
+                raise UsageError(f"{file}: a row has {where}, where {words} belongs")
+            found[name][place] = number
     return found
 
 

@@ -58,12 +58,23 @@ def unpack(packed: dict[str, np.ndarray], like: Any) -> Any:
         if path not in packed:
             return jnp.zeros(x.shape, x.dtype)
         data = jnp.asarray(packed[path])
-        value = jax.random.wrap_key_data(data) if _is_key(x) else data
+        value = _as_key(data) if _is_key(x) else data
         if (value.shape, value.dtype) != (x.shape, x.dtype):
             raise UsageError(f"the checkpoint's {path} is {value.dtype}{value.shape}, expected {x.dtype}{x.shape}")
         return value
 
     return treedef.unflatten([restore(path, x) for path, x in expected.items()])
+
+
+def _as_key(data: jax.Array) -> jax.Array:
+    """Random keys from their numbers, of the kind that this process draws with."""
+    try:
+        return jax.random.wrap_key_data(data)
+    except TypeError:
+        raise UsageError(
+            "the checkpoint's random keys are of another kind than those of this process; set JAX_DEFAULT_PRNG_IMPL to "
+            "what the run was trained with"
+        ) from None
 
 
 def _is_key(x: Any) -> bool:
@@ -92,6 +103,21 @@ def has_checkpoint(folder: pathlib.Path) -> bool:
     return processes.by_first(lambda: any(path.name.isdigit() for path in (folder / "checkpoints").glob("*")))
 
 
+def check_name(folder: pathlib.Path) -> None:
+    """Refuses a folder whose path cannot be encoded in UTF-8: orbax would end in a traceback.
+
+    Raises:
+      UsageError: it cannot.
+    """
+    try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError:
+        raise UsageError(
+            f"the path {folder} is not UTF-8, which checkpoints need; rename the folder, or set PYTHONUTF8=1 if the "
+            "locale has another encoding"
+        ) from None
+
+
 class Checkpoints:
     """The checkpoints of a run folder, named by their step; the newest `KEEP` are kept.
 
@@ -100,6 +126,7 @@ class Checkpoints:
 
     def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
         """Opens the checkpoints of `folder`; `read_only` changes nothing on disk."""
+        check_name(folder)
         self._folder = (folder / "checkpoints").absolute()
         self._manager: Any = None
         processes.by_first(lambda: self._open(read_only))

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .. import numerics
 from ..config.settings import Config
 from ..errors import UsageError
 from ..learning.setup import Setup, make_setup
@@ -33,6 +34,7 @@ from .run_folder import state_like
 from .signals import CAUGHT
 
 SETTINGS = (  # of JAX, which a worker takes over
+    *numerics.RECORDED,
     "jax_default_matmul_precision",
     "jax_enable_compilation_cache",
     "jax_compilation_cache_dir",
@@ -112,7 +114,7 @@ class Workers:
             self._processes.append(process)
             self._pipes.append(ours)
             part = config.replace(seed=config.seed + begin, seeds=end - begin)
-            self._send(rank, (part, {name: getattr(jax.config, name) for name in SETTINGS}))
+            self._send(rank, (part, {name: x for name, x in jax.config.values.items() if name in SETTINGS}))
 
     def call(self, program: str, state: LearnerState) -> Any:
         """What every worker's `program` returns for its seeds of `state`, put together along the seeds."""

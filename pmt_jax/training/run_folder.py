@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import numerics
 from ..config.load import load_config, to_toml
 from ..config.settings import Config, differences
 from ..errors import UsageError
@@ -25,7 +26,7 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from .checkpoint import Checkpoints
+from .checkpoint import Checkpoints, check_name
 from .metrics import Row
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -55,8 +56,9 @@ def check_out(out: pathlib.Path, resume: bool) -> None:
     """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
 
     Raises:
-      UsageError: it is a file, or holds no run to resume.
+      UsageError: it is a file, has a name that cannot be encoded, or holds no run to resume.
     """
+    check_name(out)
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file, not a folder; choose another --out")
     if resume and not (out / "config.toml").is_file():
@@ -121,10 +123,9 @@ def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> No
 
 
 def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
-    """Refuses another engine, which computes another run; says which versions changed, which costs the last bits."""
-    try:
-        old = dict(json.loads((out / "versions.json").read_text()))
-    except (OSError, ValueError, TypeError):
+    """Refuses another engine or other random numbers; says which versions changed, which costs the last bits."""
+    old = _recorded_versions(out)
+    if old is None:
         say(f"{out / 'versions.json'} cannot be read: the engine and the versions of the run are unknown")
         return
     new = versions(setup)
@@ -134,9 +135,19 @@ def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
             f"'{new['engine']}' on this {new['device']}, whose numbers differ; resume it where '{old['engine']}' runs, "
             "or choose another --out"
         )
-    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    plain = [name for name in new if name in old and not isinstance(new[name], dict)]
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in plain if old[name] != new[name]]
+    changed += numerics.changes(old, new, out)
     if changed:
         say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
+
+
+def _recorded_versions(out: pathlib.Path) -> dict[str, Any] | None:
+    """What versions.json holds; None if it cannot be read."""
+    try:
+        return dict(json.loads((out / "versions.json").read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
 
 
 def versions(setup: Setup) -> dict[str, Any]:
@@ -144,7 +155,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1, "jobs": setup.jobs}
-    return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION}
+    return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 
 def write_settings(out: pathlib.Path, setup: Setup) -> None:
@@ -186,7 +197,7 @@ def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
 
 
 def _check_number(metrics: pathlib.Path, row: Row, name: str) -> None:
-    if not isinstance(row.get(name), int | float) or isinstance(row[name], bool):
+    if not isinstance(row.get(name), int | float) or isinstance(row[name], bool) or not abs(row[name]) < 2**63:
         raise UsageError(
             f"{metrics} holds a row with {name} = {json.dumps(row.get(name))}, where a number was expected; delete "
             "that line and --resume again"
@@ -234,10 +245,11 @@ def load_saved(
         raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
-    like = state_like(setup)
     checkpoints = Checkpoints(folder, read_only=True)
     try:
-        step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
+        with numerics.keys_of(_recorded_versions(folder) or {}):
+            like = state_like(setup)
+            step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
     finally:
         checkpoints.close()
     return setup, step, saved

@@ -121,7 +121,7 @@ train lane --out= | . already holds other files
 train lane --out notrun --resume | there is no run to resume in notrun: it has no config.toml
 train lane --profile file --out x | file: File exists
 train lane --resum --out x | unknown argument '--resum'; did you mean '--resume'?
-train lane --trust | unknown argument '--trust'
+table x --trust | unknown argument '--trust'
 train lane --no-cache=3 | argument --no-cache: ignored explicit argument '3'
 sweep lane | the following arguments are required: --out
 sweep lane --set =1 --out s | unknown setting ''

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import json
 import pathlib
 import re
+import shutil
 import tomllib
 
 import jax
@@ -146,13 +148,70 @@ def test_what_is_told_about_them_and_how_large_they_are():
     assert sum(row["bytes"] for row in told) < 4e6
 
 
+def test_their_checksums_are_those_of_their_files():
+    """As `sha256sum -c` reads them."""
+    lines = [line.split("  ") for line in (hub.FOLDER / "SHA256SUMS").read_text().splitlines()]
+    files = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in hub.FOLDER.glob("*.npz")}
+    assert files == {name: checksum for checksum, name in lines} and len(lines) == len(files) == len(NAMES)
+
+
+def cut(file: pathlib.Path) -> None:
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+def flip(file: pathlib.Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+def replace_by_a_folder(file: pathlib.Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+DAMAGE = {
+    "empty": lambda file: file.write_bytes(b""),
+    "cut": cut,
+    "flipped": flip,
+    "text": lambda file: file.write_text("no archive"),
+    "lost": lambda file: file.unlink(),
+    "folder": replace_by_a_folder,
+    "of another method": lambda file: shutil.copy(hub.file_of("hub:ant_2x4/mappo"), file),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_policy_costs_only_itself(damage: str, tmp_path: pathlib.Path, monkeypatch, cli):
+    shutil.copytree(hub.FOLDER, tmp_path / "hub")
+    monkeypatch.setattr(hub, "FOLDER", tmp_path / "hub")
+    monkeypatch.chdir(tmp_path)
+    name = "hub:ant_2x4/happo"
+    DAMAGE[damage](hub.file_of(name))
+    code, out, err = cli("hub")
+    assert code == 0 and err.count("\n") == 1 and err.startswith(f"left out: {name} is damaged: ")
+    assert [line.split()[0] for line in out.splitlines()[1:]] == [other for other in NAMES if other != name]
+    for command in (("eval", name), ("render", name, "-o", "x.html"), ("export", name, "-o", "x"), ("train", "lane")):
+        init = ("--init", name) if command[0] == "train" else ()
+        code, _, err = cli(*command, *init)
+        assert code == 2 and err.count("\n") == 1 and f"{name} is damaged: {hub.file_of(name)}" in err
+    assert hub.about("hub:ant_2x4/mappo")["method"] == "mappo"
+
+
+def test_a_file_that_is_not_of_the_package_is_no_policy(empty_hub: pathlib.Path, cli):
+    """Whoever puts a file there may name any task in it, a Python file too."""
+    empty_hub.mkdir()
+    np.savez(empty_hub / "lane-mine.npz", config=np.array('task = "mine.py"'), about=np.array("{}"))
+    assert "hub:lane/mine is damaged" in cli("eval", "hub:lane/mine")[2]
+
+
 def test_they_come_with_the_wheel():
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "pmt_jax.policies.pretrained" in table["packages"]
     inside = {
         file for pattern in table["package-data"]["pmt_jax.policies.pretrained"] for file in hub.FOLDER.glob(pattern)
     }
-    assert inside >= {hub.file_of(name) for name in NAMES}
+    assert inside >= {hub.FOLDER / "SHA256SUMS", *map(hub.file_of, NAMES)}
 
 
 def test_packing_costs_no_reward_and_no_safety():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import pathlib
+import warnings
 
 import numpy as np
 import pytest
@@ -114,12 +116,42 @@ def test_folders_of_runs_are_searched_and_what_is_no_run_is_left_out(tmp_path: p
         (row(10, 0, 1.0, episode_cost="much"), 'has episode_cost = "much" at step 10, where a number or null belongs'),
         (row(10, 0, 1.0, episode_cost=[1, 2]), "has episode_cost = [1, 2] at step 10"),
         (row(10, True, 1.0), "has seed = true, where a whole number belongs"),
+        (row(10**400, 0, 1.0), f"has step = {'1' + 39 * '0'}, where a whole number from 0 to 2**63 belongs"),
+        (row(2**63, 0, 1.0), f"has step = {2**63}, where a whole number from 0 to 2**63 belongs"),
+        (row(-1, 0, 1.0), "has step = -1, where a whole number from 0 to 2**63 belongs"),
+        (row(10, 10**400, 1.0), "where a whole number from 0 to 2**63 belongs"),
+        (row(10, 0, 1.0, cost_limit=10**400), "where a number from 0 to 2**63 belongs"),
+        (row(10, 0, 1e308), "has episode_reward = 1e+308 at step 10, where a number of 32 bits or null belongs"),
+        (row(10, 0, 1.0, episode_cost=-1e39), "has episode_cost = -1e+39 at step 10, where a number of 32 bits"),
+        (row(10, 0, 1.0, seconds=10**400), "at step 10, where a number or null belongs"),
     ],
 )
 def test_rows_of_the_wrong_type_get_one_sentence(command: str, line: str, says: str, tmp_path: pathlib.Path, cli):
     folder = written(tmp_path / "a", [line])
     code, _, err = cli(command, folder)
     assert code == 2 and says in err and str(folder / "metrics.jsonl") in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["table", "plot", "compare"])
+@pytest.mark.parametrize("number", [3.4e38, -3.4e38, 1e-45, 5e-324, math.inf, -math.inf, math.nan])
+def test_the_largest_and_smallest_numbers_need_no_warnings(command: str, number: float, tmp_path: pathlib.Path, cli):
+    """All that 32 bits hold, and what JSON makes of 1e309; a limit may be any number."""
+    runs = []
+    for name, limit in (("a", 1.0), ("b", 1e308)):
+        lines = [
+            row(10 * i, seed, number if seed else -number, episode_cost=number, cost_limit=limit, **{"lambda": number})
+            for i in range(1, 21)
+            for seed in (0, 1)
+        ]
+        runs.append(written(tmp_path / name, lines))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = ("-o", tmp_path / "x.svg") if command == "plot" else ()
+        code, _, err = cli(command, *runs, *out)
+    if command == "plot" and not math.isfinite(number):
+        assert code == 2 and "nothing to draw of lane: no metric of its runs is a finite number" in err
+    else:
+        assert code == 0 and not err
 
 
 @pytest.mark.parametrize("command", ["table", "plot", "report"])

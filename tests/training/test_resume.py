@@ -177,7 +177,18 @@ def test_fewer_steps_than_are_done_change_nothing(copy: pathlib.Path, cli):
     assert {path.name: path.read_bytes() for path in copy.glob("*.*")} == before
 
 
-@pytest.mark.parametrize("row", ['{"step": "many"}', '{"seed": 0}', '{"step": 200, "seed": 0, "seconds": null}'])
+@pytest.mark.parametrize(
+    "row",
+    [
+        '{"step": "many"}',
+        '{"seed": 0}',
+        '{"step": 200, "seed": 0, "seconds": null}',
+        f'{{"step": {10**400}, "seed": 0, "seconds": 1}}',
+        f'{{"step": 200, "seed": {10**400}, "seconds": 1}}',
+        f'{{"step": 200, "seed": 0, "seconds": {10**400}}}',
+        '{"step": 200, "seed": 0, "seconds": 1e309}',
+    ],
+)
 def test_a_row_that_is_none_of_a_run(row: str, copy: pathlib.Path, cli):
     metrics = copy / "metrics.jsonl"
     metrics.write_text(before := metrics.read_text() + row + "\n")
