@@ -18,14 +18,13 @@ from ..config.load import load_config
 from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
-from ..limits import KEY, WORST, Limits, judged, of_agents
+from ..limits import KEY, LARGEST, WORST, Limits, judged, of_agents
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
 IDENTITY = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
 TEXT = ("broken",)  # besides
-LARGEST = float(np.finfo(np.float32).max)  # training computes in 32 bits, so larger numbers are no run's
 
 
 @dataclasses.dataclass(frozen=True)
