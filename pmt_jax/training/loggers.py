@@ -75,12 +75,17 @@ class Jsonl:
     """metrics.jsonl: one JSON object a line; null for what is not finite."""
 
     def __init__(self, path: pathlib.Path) -> None:
-        self._file = path.open("a")
+        self._file = path.open("a+")
 
     def write(self, rows: list[Row]) -> None:
         for row in rows:
             self._file.write(json.dumps(finite(row)) + "\n")
         self._file.flush()
+
+    def text(self) -> str:
+        """All that the file holds, even if it was deleted or renamed meanwhile."""
+        self._file.seek(0)
+        return self._file.read()
 
     def close(self) -> None:
         self._file.close()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
+from .history import Row
 
-Row = dict[str, Any]
 Reduction = Literal["mean", "sum", "loss"]
 
 
