@@ -231,7 +231,7 @@ class Checkpoints:
             create=not several,
             cleanup_tmp_directories=True,  # what a kill in the middle of a save left behind
             enable_async_checkpointing=False,
-            multiprocessing_options=ocp.options.MultiprocessingOptions(active_processes={0} if several else None),
+            multiprocessing_options=_alone(),
         )
         return ocp.CheckpointManager(self._folder, options=options)
 
@@ -298,7 +298,7 @@ def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
         for folder, _, names in os.walk(step, onerror=_raise):  # this fails with the system's reason, orbax does not
             for name in names:
                 pathlib.Path(folder, name).read_bytes()
-        with _quiet(), ocp.StandardCheckpointer() as checkpointer:
+        with _quiet(), ocp.StandardCheckpointer(multiprocessing_options=_alone()) as checkpointer:
             restored: Any = checkpointer.restore((step / "default").absolute())
         if "npz" not in restored:
             raise _Damaged("it is of another version of pmt-jax")
@@ -309,6 +309,11 @@ def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # whatever orbax and tensorstore make of damaged files
         raise _Damaged(_reason(error)) from error
+
+
+def _alone() -> ocp.options.MultiprocessingOptions:
+    """For the first of several processes, which would else wait for the others to read and write with it."""
+    return ocp.options.MultiprocessingOptions(active_processes={0} if jax.process_count() > 1 else None)
 
 
 def _raise(error: OSError) -> None:

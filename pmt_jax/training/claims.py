@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from ..errors import UsageError
+from ..files import is_open_at
 
 NAME = ".claim"
 
@@ -36,10 +37,7 @@ class _Claim(NamedTuple):
     @property
     def holds(self) -> bool:
         """Whether the file at the path is still the one that was opened."""
-        try:
-            return os.path.samestat(os.fstat(self.file), self.path.stat())
-        except (FileNotFoundError, NotADirectoryError):
-            return False
+        return is_open_at(self.file, self.path)
 
 
 _held: dict[pathlib.Path, _Claim] = {}  # by folder, as its path was given

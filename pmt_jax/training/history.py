@@ -60,8 +60,8 @@ def missing_rows(config: Config, changes: Sequence[Row], rows: Sequence[Row], un
     """Which rows up to step `until` are not among `rows`, in words; None if all are.
 
     Args:
-      rows: as metrics.jsonl holds them, each with a step and a seed. Rows of other steps or seeds than those that
-        `config` means are only compared with each other.
+      rows: as metrics.jsonl holds them, each with a step and a seed. If some are of steps at which `config` writes
+        none, the seeds are only compared with each other.
     """
     seen = {(row["seed"], row["step"]) for row in rows if row["step"] <= until}
     present = {step for _, step in seen}
@@ -69,16 +69,16 @@ def missing_rows(config: Config, changes: Sequence[Row], rows: Sequence[Row], un
     if not present <= set(steps):
         steps = sorted(present)
     seeds = range(config.seed, config.seed + config.seeds)
-    if not {seed for seed, _ in seen} <= set(seeds):
-        seeds = sorted({seed for seed, _ in seen})
     missing = {seed: [step for step in steps if (seed, step) not in seen] for seed in seeds}
     missing = {seed: lost for seed, lost in missing.items() if lost}
     if not missing:
         return None
     each = [f"{len(lost)} of seed {seed} ({_between(lost)})" for seed, lost in missing.items()]
     more = f" and of {len(each) - SHOWN} more seeds" if len(each) > SHOWN else ""
-    count = sum(map(len, missing.values()))
-    return f"{count} of {len(steps) * len(seeds)} rows up to step {until:,}: {', '.join(each[:SHOWN])}{more}"
+    others = sorted({seed for seed, _ in seen} - set(seeds))
+    foreign = f"; it has rows of other seeds: {', '.join(map(str, others[:SHOWN]))}" if others else ""
+    count, wanted = sum(map(len, missing.values())), len(steps) * len(seeds)
+    return f"{count} of {wanted} rows up to step {until:,}: {', '.join(each[:SHOWN])}{more}{foreign}"
 
 
 def _between(steps: list[int]) -> str:

@@ -172,14 +172,17 @@ class RunFolder:
         """Whether the folder is still the one that was claimed, which must be so before anything is written.
 
         Raises:
-          Gone: it was deleted, renamed or replaced.
+          Gone: it, or the file of its rows, was deleted, renamed or replaced.
         """
-        if not self._is_held():
-            raise claims.Gone(f"{self.path} was deleted, renamed or replaced while it trained")
+        if gone := self._gone():
+            raise claims.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
 
     @processes.in_first
-    def _is_held(self) -> bool:
-        return claims.is_held(self.path)
+    def _gone(self) -> pathlib.Path | None:
+        if not claims.is_held(self.path):
+            return self.path
+        whole = all(logger.is_there for logger in self._loggers if isinstance(logger, Jsonl))
+        return None if whole else self.path / "metrics.jsonl"
 
     def begin(self) -> None:
         """Makes the folder that of a new run."""
