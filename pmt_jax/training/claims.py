@@ -72,19 +72,12 @@ def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
         _release(folder)
 
 
-def check(folder: pathlib.Path) -> None:
-    """Whether `folder`, which this process has claimed, is still the folder at its path.
+def is_held(folder: pathlib.Path) -> bool:
+    """Whether this process has claimed `folder`, and it is still the folder at its path.
 
     Raises:
-      Gone: it is not.
       OSError: the path cannot be looked up (a network share that is away).
     """
-    if not is_held(folder):
-        raise Gone(f"{folder} was deleted, renamed or replaced meanwhile")
-
-
-def is_held(folder: pathlib.Path) -> bool:
-    """Whether this process has claimed `folder`, and it is still the folder at its path; an OSError as in `check`."""
     return folder in _held and _held[folder].holds
 
 
