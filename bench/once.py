@@ -25,7 +25,7 @@ from pmt_jax import load_config, make_setup, tasks
 from pmt_jax.learning.evaluation import EVALUATION_KEY
 from pmt_jax.policies.evaluate import evaluate_baseline
 from pmt_jax.training import run_folder, trainer
-from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.checkpoint import Checkpoints, Provenance, newest, unpack
 from pmt_jax.training.compile import compile_run
 
 from .cases import Case
@@ -101,10 +101,10 @@ def checkpoint(case: Case) -> Row:
     saved = {"last": box[0], "best": box[1]}
     with tempfile.TemporaryDirectory() as out:
         kept = Checkpoints(pathlib.Path(out))
-        save = [_seconds(lambda step=step: kept.save(step, saved)) for step in range(SAVES)]
-        load = [_seconds(lambda: kept.load(saved, print)) for _ in range(SAVES)]
-        newest = pathlib.Path(out) / "checkpoints" / str(SAVES - 1)
-        size = sum(file.stat().st_size for file in newest.rglob("*") if file.is_file())
+        save = [_seconds(lambda step=step: kept.save(step, saved, Provenance(setup.config))) for step in range(SAVES)]
+        load = [_seconds(lambda: unpack(newest(pathlib.Path(out), print).packed, saved)) for _ in range(SAVES)]
+        last = pathlib.Path(out) / "checkpoints" / str(SAVES - 1)
+        size = sum(file.stat().st_size for file in last.rglob("*") if file.is_file())
         kept.close()
     saving, copying, training = (statistics.median(seconds[1:]) for seconds in (save, copy, chunk))
     return {

@@ -67,6 +67,18 @@ def replace_text(path: pathlib.Path, text: str) -> None:
     partial.replace(path)
 
 
+def is_open_at(file: int, path: pathlib.Path) -> bool:
+    """Whether the descriptor `file` is of what is at `path` now: it was not deleted, renamed or replaced since.
+
+    Raises:
+      OSError: the path cannot be looked up (a network share that is away).
+    """
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+
+
 def to_stderr(line: str) -> None:
     """Prints a line that is no result."""
     print(line, file=sys.stderr)

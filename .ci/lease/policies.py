@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.checkpoint import Checkpoints, Provenance
 from pmt_jax.training.run_folder import load_saved
 
 SENT = pathlib.Path("/tmp/sent")  # an empty file for each run that is packed
@@ -25,7 +25,7 @@ MOST = 7  # a call brings eight files home, and the metrics are one
 
 def slim(run: pathlib.Path, to: pathlib.Path) -> None:
     """Copies a run folder; see the module."""
-    _, step, saved = load_saved(run, physics="auto")
+    setup, step, saved = load_saved(run, physics="auto")
 
     def kept(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
         name = jax.tree_util.keystr(path)
@@ -37,7 +37,7 @@ def slim(run: pathlib.Path, to: pathlib.Path) -> None:
     for name in ("config.toml", "versions.json", "metrics.jsonl"):
         shutil.copy(run / name, to)
     checkpoints = Checkpoints(to)
-    checkpoints.save(step, jax.tree_util.tree_map_with_path(kept, saved))
+    checkpoints.save(step, jax.tree_util.tree_map_with_path(kept, saved), Provenance(setup.config))
     checkpoints.close()
 
 

@@ -5,13 +5,18 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import pathlib
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from .. import numerics
 from ..errors import UsageError
+
+_PACKAGE = pathlib.Path(__file__).parents[1]
 
 
 def answer(name: str, command: Callable[[], int]) -> int:
@@ -20,7 +25,8 @@ def answer(name: str, command: Callable[[], int]) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what the terminal cannot show
     try:
-        code = command()
+        with _plain_warnings(name):
+            code = command()
         sys.stdout.flush()  # here, where a closed pipe is noticed, and not when Python ends
         return code
     except UsageError as error:
@@ -59,11 +65,32 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     return type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and str(error).startswith(_NO_MEMORY)
 
 
+@contextlib.contextmanager
+def _plain_warnings(name: str) -> Iterator[None]:
+    """Inside, our own warnings are a sentence each, without the place in our code; those of others are as they are."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], filename: str, *rest: Any, **more: Any) -> None:
+            if pathlib.Path(filename).is_relative_to(_PACKAGE):
+                _print(name, str(message))
+            else:
+                others(message, category, filename, *rest, **more)
+
+        warnings.showwarning = show
+        yield
+
+
 def _refuse(name: str, sentence: str) -> int:
-    """Prints why `name` did nothing, control characters escaped; returns the exit code."""
+    """Prints why `name` did nothing; returns the exit code."""
+    _print(name, sentence)
+    return 2
+
+
+def _print(name: str, sentence: str) -> None:
+    """Prints a sentence that is no result, control characters escaped."""
     shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in sentence)
     print(f"{name}: {shown}", file=sys.stderr)
-    return 2
 
 
 @contextlib.contextmanager

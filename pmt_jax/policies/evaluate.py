@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pathlib
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,7 +20,7 @@ from ..limits import Limits
 from ..training.compile import evaluate_seeds
 from ..training.health import NO_ROOM
 from ..training.metrics import seed_intervals
-from ..training.run_folder import MATMUL_PRECISION, Say
+from ..training.run_folder import MATMUL_PRECISION
 from . import hub
 from .load import load_run
 
@@ -29,7 +31,7 @@ def evaluate_run(
     deterministic: bool,
     which: str = "last",
     physics: str | None = None,
-    say: Say = print,
+    say: Callable[[str], object] = warnings.warn,
     save: pathlib.Path | None = None,
 ) -> list[dict[str, Any]]:
     """One row per seed of a run: each metric's mean over episodes and the half-width of its 95 % interval.
@@ -41,6 +43,7 @@ def evaluate_run(
       deterministic: take mean actions instead of samples.
       which: `last` or `best`.
       physics: an engine other than the run's.
+      say: called with a sentence for each damaged checkpoint, which is passed over.
       save: an .npz file for every step of every episode (docs/howto/evaluate.md lists its arrays).
 
     Raises:

@@ -19,6 +19,7 @@ from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
 from ..limits import KEY, LARGEST, WORST, Limits, judged, of_agents
+from ..training.history import checkpoint_steps, missing_rows, read_changes
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
@@ -209,7 +210,8 @@ def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
 def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
     """The run in `folder`; None if it has no metrics yet.
 
-    Damaged lines are left out with a note; if a step occurs twice, the later line counts.
+    Damaged lines are left out with a note, and rows that are missing get one; if a step occurs twice, the later line
+    counts.
 
     Raises:
       UsageError: settings or metrics that cannot be read, or are of the wrong type.
@@ -219,7 +221,7 @@ def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
         rows = read_rows(metrics, missing_ok=False, note=note)
     except OSError as error:
         raise UsageError(f"{folder} has no metrics: cannot read its metrics.jsonl ({error.strerror})") from None
-    return _log(folder, rows, metrics, _config(folder / "config.toml")) if rows else None
+    return _log(folder, rows, metrics, _config(folder / "config.toml"), note) if rows else None
 
 
 def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
@@ -230,17 +232,22 @@ def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
         configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
         rows = program_folder.rows(group, configs, note)
         missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
-        logs = [_log(group.parent / name, rows[name], metrics, configs[name]) for name in missing]
+        logs = [_log(group.parent / name, rows[name], metrics, configs[name], note) for name in missing]
         if logs:
             note(f"not ended: {len(logs)} point(s) of {group.parent}, read at step {logs[0].steps[-1]:,}")
         found += logs
     return found
 
 
-def _log(folder: pathlib.Path, rows: Sequence[dict[str, Any]], metrics: pathlib.Path, config: Config) -> RunLog:
+def _log(
+    folder: pathlib.Path, rows: Sequence[dict[str, Any]], metrics: pathlib.Path, config: Config, note: Note
+) -> RunLog:
     """The run in `folder`, of its rows in the file `metrics`."""
     for row in rows:
         _check(row, metrics)
+    changes = read_changes(metrics.parent, note)
+    if missing := missing_rows(config, changes, rows, _written(metrics.parent, rows)):
+        note(f"{folder} lacks {missing}; what is averaged over steps is of the others")
     steps, seeds = (sorted({row[name] for row in rows}) for name in ("step", "seed"))
     last = max(rows, key=lambda row: row["step"])
     return RunLog(
@@ -248,7 +255,7 @@ def _log(folder: pathlib.Path, rows: Sequence[dict[str, Any]], metrics: pathlib.
         task=last["task"],
         method=last["method"],
         limits=Limits.of_row(last),
-        settings=flat(config) | _changes(metrics.parent),
+        settings=flat(config) | _changed(changes),
         seeds=tuple(seeds),
         steps=np.array(steps),
         metrics=_metrics(rows, seeds, steps, metrics),
@@ -302,16 +309,16 @@ def _metrics(
     return found
 
 
-def _changes(folder: pathlib.Path) -> dict[str, str]:
+def _changed(changes: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Which settings changed after which step (--change), as one more setting; {} if none did."""
-    file = folder / "changes.jsonl"
-    try:
-        told = [f"{name} {x} at {row['step']:,}" for row in read_rows(file) for name, x in row["changed"].items()]
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise UsageError(
-            f"{file}: a line is not of the form that --resume --change writes; mend or remove it"
-        ) from None
-    return {"changed": "; ".join(told)} if told else {}
+    each = [f"{name} {x} at {row['step']:,}" for row in changes for name, x in row["changed"].items()]
+    return {"changed": "; ".join(each)} if each else {}
+
+
+def _written(folder: pathlib.Path, rows: Sequence[dict[str, Any]]) -> int:
+    """The step up to which all rows must be there: of the newest checkpoint, or of the last row but one."""
+    steps = sorted({row["step"] for row in rows})[:-1]  # the rows of the last may be being written
+    return max([*steps[-1:], *checkpoint_steps(folder)[:1]], default=0)
 
 
 def _versions(folder: pathlib.Path) -> dict[str, Any]:

@@ -22,10 +22,10 @@ from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
-from ..training import trainer
-from ..training.checkpoint import Checkpoints
+from ..training import claims, trainer
+from ..training.checkpoint import Checkpoints, Provenance
 from ..training.claims import claim
-from ..training.run_folder import Say, load_saved
+from ..training.run_folder import Rescue, Say, load_saved
 from . import program_folder, table, workers
 from .points import Part, Points, drawn
 from .rows import rows
@@ -150,6 +150,9 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
         spread = workers.gpus() if count is None else ()  # a number of devices means those, for every program
         return workers.run([workers.command(p.folder, p.out, cache, count) for p in programs], at_once, say, spread)
     for title, program in titled:
+        if not claims.is_held(program.out):
+            say(f"stopped: {program.out} was deleted, renamed or replaced meanwhile; what follows is not trained")
+            return 1
         say(title)
         code = train_program(program.folder, program.out, cache, say, count)
         if code:
@@ -200,6 +203,8 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
 def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
     """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
     group = program_folder.points(folder)
+    if not group:
+        raise UsageError(f"{folder} holds no points to train; it was deleted or replaced meanwhile")
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])
     settings = [dataclasses.replace(setup, config=config).hyper for config in configs]
@@ -210,11 +215,22 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     )  # settings that are shared keep the last bits of a run
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
-    how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare}
-    code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
-    if code == 0:
-        _cut(folder, group, out)
+    files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
+    how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare, "rescue": Rescue(out, files)}
+    with claim(folder):
+        code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
+        if code == 0:
+            code = _finish(folder, group, out, say)
     return code
+
+
+def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) -> int:
+    """Cuts a finished group, if its folder is still there; returns the exit code."""
+    if not claims.is_held(folder):
+        say(f"stopped: {folder} was deleted, renamed or replaced; its points get no folders in {out}")
+        return 1
+    _cut(folder, group, out)
+    return 0
 
 
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
@@ -226,15 +242,16 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
             continue
         first = number * config.seeds  # of its trials
         limits = dataclasses.replace(setup, config=config).limits  # the task's own, too, not rounded
-        mine = [row | limits.columns for row in rows[name]]
+        own = [row | limits.columns for row in rows[name]]
         part = folder / "points" / name
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         (part / "config.toml").write_text(to_toml(config))
-        (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in mine))
+        (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in own))
         shutil.copy(folder / "run" / "versions.json", part)
         checkpoints = Checkpoints(part)
-        checkpoints.save(step, jax.tree.map(lambda x: x[first : first + config.seeds], saved))  # noqa: B023
+        mine = jax.tree.map(lambda x: x[first : first + config.seeds], saved)  # noqa: B023
+        checkpoints.save(step, mine, Provenance(config))
         checkpoints.close()
         part.rename(out / name)
     done = folder.with_name(folder.name.replace("group", "done"))  # so that no part of it is taken for a group

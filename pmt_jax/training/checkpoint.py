@@ -2,29 +2,41 @@
 
 Flat, because orbax refuses typed keys and empty leaves, and loads parts of trees without an error: here the two sets
 of paths are compared, and a difference is an error. Bytes with a checksum, because orbax does not notice a flipped
-bit, and reports a lost one with a traceback for each of hundreds of arrays.
+bit, and reports a lost one with a traceback for each of hundreds of arrays. Each step is read by itself, because orbax
+takes what a checkpoint holds from the newest one, and would read none where that one is incomplete.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
+import json
 import logging
+import os
 import pathlib
+import tomllib
 import zlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from ..config.load import load_config, to_toml
+from ..config.settings import Config, differences
 from ..errors import UsageError
 from ..learning import sharding
+from ..learning.setup import Setup
+from ..tasks import is_file
 from . import processes
+from .history import checkpoint_steps
 
 KEEP = 2
+DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
+_PROVENANCE = "provenance"  # its name in the npz, beside the paths of arrays
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
@@ -98,9 +110,118 @@ def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def has_checkpoint(folder: pathlib.Path) -> bool:
-    """Whether a run folder holds a checkpoint that was written to its end."""
-    return processes.by_first(lambda: any(path.name.isdigit() for path in (folder / "checkpoints").glob("*")))
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """What a checkpoint belongs to.
+
+    Attributes:
+      config: the settings of its run.
+      trials: of a program of a sweep, {setting: its value in each trial}, and their seeds as `seed`; else empty.
+    """
+
+    config: Config
+    trials: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, setup: Setup) -> Provenance:
+        """What checkpoints of this setup belong to."""
+        if setup.trials is None:
+            return cls(setup.config)
+        traced = {"seed": setup.trials.seed, **vars(setup.trials.hyper)}
+        return cls(setup.config, {name: np.asarray(x).tolist() for name, x in traced.items()})
+
+    def dumps(self, step: int) -> np.ndarray:
+        """[bytes] uint8, JSON: what is said of the checkpoint after `step`."""
+        seeds = self.trials.get("seed") or [self.config.seed + i for i in range(self.config.seeds)]
+        said = {"step": step, "seeds": seeds, "settings": to_toml(self.config), "trials": self.trials}
+        return np.frombuffer(json.dumps(said).encode(), np.uint8)
+
+    @classmethod
+    def loads(cls, data: np.ndarray) -> tuple[int, Provenance]:
+        """The inverse of `dumps`.
+
+        Raises:
+          UsageError: it has settings that this version of pmt-jax does not know.
+        """
+        said = json.loads(data.tobytes())
+        return said["step"], cls(load_config(tomllib.loads(said["settings"])), said["trials"])
+
+    def differences(self, other: Provenance) -> dict[str, str]:
+        """{setting: 'ours -> theirs'} of all that differs but the steps to train.
+
+        A Python file is the same task in another folder. Trials are not compared where one of both has none.
+        """
+        found = differences(self.config, other.config)
+        tasks = [provenance.config.task for provenance in (self, other)]
+        if all(map(is_file, tasks)) and len({pathlib.Path(task).name for task in tasks}) == 1:
+            found.pop("task", None)
+        if self.trials and other.trials:
+            pairs = {name: (repr(x), repr(other.trials.get(name))) for name, x in self.trials.items()}
+            found |= {f"{name} of the trials": f"{x} -> {y}" for name, (x, y) in pairs.items() if x != y}
+        return {name: change for name, change in found.items() if name != "steps"}
+
+
+class Saved(NamedTuple):
+    """A checkpoint as it was read.
+
+    Attributes:
+      step: environment steps of each seed; packed: {path: array}, see `pack`.
+      provenance: what it belongs to; None if it does not say so.
+      damaged: the steps of newer ones that are not whole.
+    """
+
+    step: int
+    packed: dict[str, np.ndarray]
+    provenance: Provenance | None
+    damaged: list[int]
+
+
+def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: bool = False) -> Saved:
+    """The newest checkpoint of a run folder that is whole; only the first of several processes may call it.
+
+    Args:
+      warn: called with a sentence for every newer one that is not, and if it does not say what it belongs to.
+      to_continue: a newer one that the disk does not give now is an error, because it may be whole.
+
+    Raises:
+      UsageError: there is none, or it is of another step than its name says.
+    """
+    damaged, place, steps = [], folder / "checkpoints", checkpoint_steps(folder)
+    for step in steps:
+        try:
+            packed = _read(place / str(step))
+        except (_Damaged, OSError) as error:
+            said = f"the checkpoint after {step:,} steps in {place} cannot be read ({_reason(error)})"
+            if to_continue and isinstance(error, OSError):
+                raise UsageError(
+                    f"{said}; it may be whole: mend the cause and resume again, or move that folder elsewhere to "
+                    "continue from the one before"
+                ) from None
+            warn(said)
+            damaged.append(step)
+            continue
+        return Saved(step, packed, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
+    if steps:
+        raise UsageError(f"no checkpoint in {place} can be read; restore one from a backup or train anew")
+    raise UsageError(f"there is no finished checkpoint in {place}; train the run first")
+
+
+def _provenance(
+    place: pathlib.Path, step: int, data: np.ndarray | None, warn: Callable[[str], object]
+) -> Provenance | None:
+    if data is None:
+        warn(f"the checkpoint after {step:,} steps in {place} does not say which run it belongs to")
+        return None
+    try:
+        written, provenance = Provenance.loads(data)
+    except UsageError as error:
+        raise UsageError(f"the checkpoint after {step:,} steps in {place}: {error}") from None
+    if written != step:
+        raise UsageError(
+            f"{place / str(step)} holds the checkpoint after {written:,} steps; give it its name back, "
+            f"{written}, or move it elsewhere"
+        )
+    return provenance
 
 
 def check_name(folder: pathlib.Path) -> None:
@@ -124,29 +245,25 @@ class Checkpoints:
     Of several processes, all must call the methods, and the first reads and writes.
     """
 
-    def __init__(self, folder: pathlib.Path, read_only: bool = False) -> None:
-        """Opens the checkpoints of `folder`; `read_only` changes nothing on disk."""
+    def __init__(self, folder: pathlib.Path) -> None:
         check_name(folder)
         self._folder = (folder / "checkpoints").absolute()
         self._manager: Any = None
-        processes.by_first(lambda: self._open(read_only))
 
-    def _open(self, read_only: bool) -> None:
+    def _open(self) -> Any:
         several = jax.process_count() > 1
-        if several and not read_only:
+        if several:
             self._folder.mkdir(parents=True, exist_ok=True)  # orbax does not if one process uses it alone
-        with _quiet():
-            options = ocp.CheckpointManagerOptions(
-                max_to_keep=KEEP,
-                create=not read_only and not several,
-                cleanup_tmp_directories=not read_only,  # what a kill in the middle of a save left behind
-                read_only=read_only,
-                enable_async_checkpointing=False,
-                multiprocessing_options=ocp.options.MultiprocessingOptions(active_processes={0} if several else None),
-            )
-            self._manager = ocp.CheckpointManager(self._folder, options=options)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=KEEP,
+            create=not several,
+            cleanup_tmp_directories=True,  # what a kill in the middle of a save left behind
+            enable_async_checkpointing=False,
+            multiprocessing_options=_alone(),
+        )
+        return ocp.CheckpointManager(self._folder, options=options)
 
-    def save(self, step: int, tree: Any) -> None:
+    def save(self, step: int, tree: Any, provenance: Provenance) -> None:
         """Writes `tree` as the checkpoint after `step` environment steps; a crash meanwhile leaves the older one whole.
 
         Raises:
@@ -154,53 +271,39 @@ class Checkpoints:
         """
         if step in self.steps():
             return
-        table = pack(tree)
-        processes.by_first(lambda: self._write(step, table))
+        self._write(step, pack(tree) | {_PROVENANCE: provenance.dumps(step)})
 
+    @processes.in_first
     def _write(self, step: int, table: dict[str, np.ndarray]) -> None:
         data = _to_bytes(table)
         try:
             with _quiet():
+                self._manager = self._manager or self._open()
                 self._manager.save(step, args=ocp.args.StandardSave({"npz": data}))
         except ValueError as error:  # tensorstore's, whatever went wrong
             raise OSError(_reason(error)) from error
 
+    @processes.in_first
     def steps(self) -> list[int]:
-        """The steps of the complete checkpoints, newest first."""
-        return processes.by_first(lambda: sorted(self._manager.all_steps(), reverse=True))
-
-    def load(self, like: Any, warn: Callable[[str], object]) -> tuple[int, Any]:
-        """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
-
-        Args:
-          warn: called with a sentence for every newer one that cannot be read.
+        """The steps of the checkpoints that were written to their end, newest first.
 
         Raises:
-          UsageError: there is none, or it belongs to another kind of run.
+          OSError: the folder cannot be read.
         """
-        step, packed = processes.by_first(lambda: self._newest(warn))
-        return step, unpack(packed, like)
+        return checkpoint_steps(self._folder.parent)
 
-    def _newest(self, warn: Callable[[str], object]) -> tuple[int, dict[str, np.ndarray]]:
-        steps = sorted(self._manager.all_steps(), reverse=True)
+    @processes.in_first
+    def set_aside(self, steps: list[int]) -> None:
+        """Moves checkpoints that are not whole into `DAMAGED`, where nothing reads them and nothing is lost.
+
+        Raises:
+          OSError: they cannot be moved.
+        """
         for step in steps:
-            try:
-                with _quiet():
-                    restored: Any = self._manager.restore(step, args=ocp.args.StandardRestore())
-                if "npz" not in restored:
-                    raise ValueError("it is of another version of pmt-jax")
-                packed = _from_bytes(np.asarray(restored["npz"]))
-            except (ValueError, KeyError, OSError) as error:
-                warn(f"the checkpoint after {step:,} steps in {self._folder} cannot be read ({_reason(error)})")
-                continue
-            return step, packed
-        if steps:
-            raise UsageError(f"no checkpoint in {self._folder} can be read; restore one from a backup or train anew")
-        raise UsageError(f"there is no finished checkpoint in {self._folder}; train the run first")
-
-    def forget_after(self, step: int) -> None:
-        """Deletes the checkpoints of later steps, from which the run does not continue."""
-        processes.by_first(lambda: [self._manager.delete(s) for s in self._manager.all_steps() if s > step])
+            folder = self._folder.with_name(DAMAGED)
+            folder.mkdir(exist_ok=True)
+            names = (f"{step}{end}" for end in ("", *(f"-{i}" for i in range(2, 10**6))))
+            (self._folder / str(step)).rename(next(folder / name for name in names if not (folder / name).exists()))
 
     def close(self) -> None:
         """Closes the folder."""
@@ -208,8 +311,47 @@ class Checkpoints:
             self._manager.close()
 
 
+class _Damaged(Exception):
+    """A checkpoint whose files can be read, but do not hold what was written."""
+
+
+def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
+    """The table of one checkpoint.
+
+    Raises:
+      OSError: the disk does not give its files.
+      _Damaged: they are not whole.
+    """
+    try:
+        for folder, _, names in os.walk(step, onerror=_raise):  # this fails with the system's reason, orbax does not
+            for name in names:
+                pathlib.Path(folder, name).read_bytes()
+        with _quiet(), ocp.StandardCheckpointer(multiprocessing_options=_alone()) as checkpointer:
+            restored: Any = checkpointer.restore((step / "default").absolute())
+        if "npz" not in restored:
+            raise _Damaged("it is of another version of pmt-jax")
+        return _from_bytes(np.asarray(restored["npz"]))
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise _Damaged("it is incomplete") from error
+    except (OSError, MemoryError, _Damaged):
+        raise
+    except Exception as error:  # whatever orbax and tensorstore make of damaged files
+        raise _Damaged(_reason(error)) from error
+
+
+def _alone() -> ocp.options.MultiprocessingOptions:
+    """For the first of several processes, which would else wait for the others to read and write with it."""
+    return ocp.options.MultiprocessingOptions(active_processes={0} if jax.process_count() > 1 else None)
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
 def _reason(error: Exception) -> str:
-    """The end of an error's first line: tensorstore begins with a page of paths."""
+    """The system's words, or the end of an error's first line: tensorstore begins with a page of paths."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return str(error).split("\n")[0].split(": ")[-1].split(" [")[0]
 
 

@@ -1,7 +1,8 @@
 """One process at a time in a folder: a file `.claim` names the process that trains there.
 
 On one host the file is locked, and the lock ends with its process, however that ends. Locks may not reach other hosts,
-so there the name in the file counts.
+so there the name in the file counts. The open file also tells whether the folder at a path is still the one that was
+claimed: a folder that was deleted, renamed or replaced has no such file, or another one.
 """
 
 from __future__ import annotations
@@ -14,12 +15,32 @@ import pathlib
 import socket
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import UsageError
+from ..files import is_open_at
 
 NAME = ".claim"
-_held: dict[pathlib.Path, tuple[int, bool]] = {}  # descriptor, and whether an empty folder goes with it
+
+
+class Gone(UsageError):
+    """A folder was deleted, renamed or replaced while this process worked in it."""
+
+
+class _Claim(NamedTuple):
+    """A claim of this process: the absolute path of its file, the open file, and whether the folder was made for it."""
+
+    path: pathlib.Path
+    file: int
+    created: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether the file at the path is still the one that was opened."""
+        return is_open_at(self.file, self.path)
+
+
+_held: dict[pathlib.Path, _Claim] = {}  # by folder, as its path was given
 
 
 @contextlib.contextmanager
@@ -31,44 +52,54 @@ def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
     Raises:
       UsageError: another process has claimed it, or it cannot be written.
     """
-    path = folder / NAME
+    path = folder.absolute() / NAME
     try:
         created |= not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        file, locked = _open(path)
+        file, locked = _open(folder, path)
         owner = _read(file)
         if _may_be_alive(owner, locked):
             os.close(file)
             raise _refusal(folder, owner)
-        _held[path] = file, created
+        _held[folder] = _Claim(path, file, created)
         _write(file)
     except OSError as error:
-        _release(path)
+        _release(folder)
         raise UsageError(f"cannot write into {folder}: {error.strerror}; choose another --out") from None
     try:
         yield
     finally:
-        _release(path)
+        _release(folder)
+
+
+def is_held(folder: pathlib.Path) -> bool:
+    """Whether this process has claimed `folder`, and it is still the folder at its path.
+
+    Raises:
+      OSError: the path cannot be looked up (a network share that is away).
+    """
+    return folder in _held and _held[folder].holds
 
 
 def release_all() -> None:
     """Gives all claims of this process up, for an end at once."""
-    for path in list(_held):
-        _release(path)
+    for folder in list(_held):
+        _release(folder)
 
 
-def _release(path: pathlib.Path) -> None:
-    if path in _held:
-        file, created = _held.pop(path)
+def _release(folder: pathlib.Path) -> None:
+    if folder in _held:
+        claim = _held.pop(folder)
         with contextlib.suppress(OSError):
-            path.unlink()
-            if created:
-                path.parent.rmdir()
-        os.close(file)
+            if claim.holds:  # another process may have the folder that is there now
+                claim.path.unlink()
+                if claim.created:
+                    claim.path.parent.rmdir()
+        os.close(claim.file)
 
 
-def _open(path: pathlib.Path) -> tuple[int, bool]:
-    """The descriptor of the claim file, and whether it is locked; UsageError if another process has the lock."""
+def _open(folder: pathlib.Path, path: pathlib.Path) -> tuple[int, bool]:
+    """The descriptor of the claim file `path`, and whether it is locked; UsageError if another process has the lock."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -76,7 +107,7 @@ def _open(path: pathlib.Path) -> tuple[int, bool]:
         except BlockingIOError:
             owner = _read(file)
             os.close(file)
-            raise _refusal(path.parent, owner) from None
+            raise _refusal(folder, owner) from None
         except OSError:  # a file system without locks
             return file, False
         with contextlib.suppress(FileNotFoundError):

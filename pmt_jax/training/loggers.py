@@ -21,7 +21,7 @@ import jax
 
 from ..config.settings import Config
 from ..errors import UsageError
-from ..files import read_rows
+from ..files import is_open_at, read_rows
 from ..tasks import did_you_mean
 from .metrics import Row
 
@@ -75,12 +75,22 @@ class Jsonl:
     """metrics.jsonl: one JSON object a line; null for what is not finite."""
 
     def __init__(self, path: pathlib.Path) -> None:
-        self._file = path.open("a")
+        self._path, self._file = path.absolute(), path.open("a+")
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the file at the path is still the one that is written to; an OSError if the disk does not say."""
+        return is_open_at(self._file.fileno(), self._path)
 
     def write(self, rows: list[Row]) -> None:
         for row in rows:
             self._file.write(json.dumps(finite(row)) + "\n")
         self._file.flush()
+
+    def text(self) -> str:
+        """All that the file holds, even if it was deleted or renamed meanwhile."""
+        self._file.seek(0)
+        return self._file.read()
 
     def close(self) -> None:
         self._file.close()

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
 from ..limits import WORST, Limits, base, judged, of_agents
+from .history import Row
 
-Row = dict[str, Any]
 Reduction = Literal["mean", "episodes", "sum", "loss"]
 
 

@@ -6,13 +6,14 @@ Only the first process reads, writes and prints; the others receive its results,
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pickle
 import re
 import socket
 import zlib
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -21,6 +22,7 @@ from jax.experimental import multihost_utils
 from ..errors import UsageError
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 
 def join(coordinator: str | None, process: int | None, processes: int | None, devices: int | None = None) -> None:
@@ -143,3 +145,13 @@ def by_first(action: Callable[[], T]) -> T:
     if code:
         raise SystemExit(code)
     return result
+
+
+def in_first(method: Callable[P, T]) -> Callable[P, T]:
+    """`method` as one that the first process alone carries out, for all of them (see `by_first`)."""
+
+    @functools.wraps(method)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return by_first(lambda: method(*args, **kwargs))
+
+    return call

@@ -1,7 +1,9 @@
-"""A run folder: what it holds, and whether a run may start or continue there."""
+"""A run folder: what it holds, whether a run may start or continue there, and what is written to it."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import functools
 import json
 import pathlib
@@ -9,7 +11,7 @@ import platform
 import re
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -18,7 +20,7 @@ import numpy as np
 
 from .. import numerics
 from ..config.load import load_config, to_toml
-from ..config.settings import Config, differences
+from ..config.settings import Config
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import learner
@@ -26,14 +28,280 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from .checkpoint import Checkpoints, check_name
-from .metrics import Row
+from . import claims, processes
+from .checkpoint import Checkpoints, Provenance, Saved, check_name, newest, unpack
+from .history import Row, checkpoint_steps, missing_rows, read_changes
+from .loggers import Jsonl, Logger, open_loggers
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 # What --change keeps: who the run is, and what is read at its start only.
 IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
+
+
+@dataclasses.dataclass(frozen=True)
+class Rescue:
+    """Where a run is saved whose folder is gone.
+
+    Attributes:
+      of: the run folder or the sweep's; the place is beside it, `OF-rescued`.
+      files: {path below that: text} of what it needs besides the run's own files.
+    """
+
+    of: pathlib.Path
+    files: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+class RunFolder:
+    """The folder of a run that trains here: its claim, settings, versions, rows and the place of its checkpoints.
+
+    The first process reads and writes. All others must call the same methods at the same points, and get its results;
+    if it fails, they end with its exit code.
+
+    Attributes:
+      path: where it is.
+      saved: the checkpoint to continue from; None if there is none, or the run is new.
+      checkpoints: where the run's states go.
+    """
+
+    def __init__(self, setup: Setup, say: Say, rescue: Rescue | None = None) -> None:
+        """A folder for a run of `setup`, which `claim` gives a place; `rescue` is beside that place if None."""
+        self.path, self.saved = pathlib.Path(), None
+        self._setup, self._say, self._rescue = setup, say, rescue
+        self._provenance = self._run = Provenance.of(setup)
+        self._changes: list[Row] = []
+        self._loggers: list[Logger] = []
+        self._claim, self._open = contextlib.ExitStack(), contextlib.ExitStack()
+
+    def claim(self, out: pathlib.Path | None, resume: bool, change: bool = False) -> None:
+        """Takes the folder `out`, or a new one if None, until `close`.
+
+        Args:
+          resume: it holds a run to continue, which `saved` is then of; otherwise it must hold none.
+          change: the settings may differ from that run's, all but `IDENTITY`.
+
+        Raises:
+          UsageError: another process has it, it holds something else, or the run was made with other settings, on
+            another physics engine, or has no checkpoint that can be read.
+        """
+        self.path, self.saved = self._take(out, resume, change)
+        self.checkpoints = self._open.enter_context(contextlib.closing(Checkpoints(self.path)))
+
+    @processes.in_first
+    def _take(self, out: pathlib.Path | None, resume: bool, change: bool) -> tuple[pathlib.Path, Saved | None]:
+        self.path = out or create(self._setup)
+        _check_path(self.path, resume)
+        self._claim.enter_context(claims.claim(self.path, created=out is None))
+        self._home = self.path.absolute()  # the working folder may be renamed
+        rescue = self._rescue or Rescue(self.path)
+        self._rescue = dataclasses.replace(rescue, of=rescue.of.absolute())
+        return self.path, self._check_content(resume, change)
+
+    def close(self) -> None:
+        """Ends writing, then gives the folder up.
+
+        Raises:
+          OSError: what was written last does not fit on the disk.
+        """
+        with self._claim:
+            self._open.close()
+
+    def _check_content(self, resume: bool, change: bool) -> Saved | None:
+        """The checkpoint to continue from, if there is one."""
+        existing = self.path / "config.toml"
+        if not resume:
+            if existing.exists() or any(x.name not in BEFORE_START and x.name[0] != "." for x in self.path.iterdir()):
+                what = "another run" if existing.exists() else "other files"
+                raise UsageError(
+                    f"{self.path} already holds {what}; choose another --out, or --resume to continue the run"
+                )
+            return None
+        self._changes = read_changes(self.path)
+        saved = newest(self.path, self._say, to_continue=True) if checkpoint_steps(self.path) else None
+        self._same_settings(saved, change)
+        self._same_machine()
+        return saved
+
+    def _same_settings(self, saved: Saved | None, change: bool) -> None:
+        """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
+        file = self.path / "config.toml"
+        self._run, edited = Provenance(load_config(file)), {}
+        if saved and saved.provenance:
+            edited = unexplained(saved, self._run.config, self._changes)
+            config = saved.provenance.config if edited else self._run.config
+            self._run = Provenance(config, saved.provenance.trials)
+        changed = self._run.differences(self._provenance)
+        refused = {name: x for name, x in changed.items() if name in IDENTITY or not change}
+        if edited and not changed:
+            self._say(
+                f"{file} was edited since the checkpoint; the run continues with the settings it had:{listed(edited)}"
+            )
+        if not refused:
+            return
+        advice = "resume it unchanged (only --steps may grow), add --change to continue with the new ones"
+        if change:
+            advice = f"--change cannot change {', '.join(refused)}; leave them as they are"
+        elif edited:
+            advice = f"{file} was edited since; mend it, add --change to continue with what it says"
+        raise UsageError(
+            f"the run in {self.path} was made with other settings; {advice}, or choose another --out:{listed(refused)}"
+        )
+
+    def _same_machine(self) -> None:
+        """Refuses another engine or other random numbers; says which versions changed, which costs the last bits."""
+        old = recorded_versions(self.path)
+        if old is None:
+            file = self.path / "versions.json"
+            self._say(f"{file} cannot be read: the engine and the versions of the run are unknown")
+            return
+        new = versions(self._setup)
+        if old.get("engine", new["engine"]) != new["engine"]:
+            raise UsageError(
+                f"the run in {self.path} was simulated by engine '{old['engine']}', but physics = "
+                f"{self._setup.config.physics} means '{new['engine']}' on this {new['device']}, whose numbers differ; "
+                f"resume it where '{old['engine']}' runs, or choose another --out"
+            )
+        plain = [name for name in new if name in old and not isinstance(new[name], dict)]
+        changed = [f"{name} {old[name]} -> {new[name]}" for name in plain if old[name] != new[name]]
+        changed += numerics.changes(old, new, self.path)
+        if changed:
+            self._say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Writing
+
+    def check(self) -> None:
+        """Whether the folder is still the one that was claimed, which must be so before anything is written.
+
+        Raises:
+          Gone: it, or the file of its rows, was deleted, renamed or replaced.
+        """
+        if gone := self._gone():
+            raise claims.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
+
+    @processes.in_first
+    def _gone(self) -> pathlib.Path | None:
+        if not claims.is_held(self.path):
+            return self.path
+        whole = all(logger.is_there for logger in self._loggers if isinstance(logger, Jsonl))
+        return None if whole else self.path / "metrics.jsonl"
+
+    def begin(self) -> None:
+        """Makes the folder that of a new run."""
+        self.check()
+        self._write_settings()
+
+    @processes.in_first
+    def _write_settings(self) -> None:
+        write_settings(self.path, self._setup)
+
+    def resume(self, step: int, ended: bool) -> list[Row]:
+        """Prepares the folder for the run that continues after `step`, the step of `saved` or 0.
+
+        What lies behind that step is set aside or dropped, and changed settings are recorded.
+
+        Args:
+          ended: no update is left to make, so that the settings stay as they are.
+
+        Returns:
+          the rows up to there.
+
+        Raises:
+          UsageError: a row is not one of a run; or other settings were asked for, and the run has ended.
+        """
+        self.check()
+        saved, self.saved = self.saved, None  # as large as the run's state
+        if ended:
+            self._check_unchanged(step)
+        if saved:
+            self.checkpoints.set_aside(saved.damaged)
+        return self._continue(step, ended, saved and saved.provenance)
+
+    @processes.in_first
+    def _check_unchanged(self, step: int) -> None:
+        if self._run.differences(self._provenance):
+            raise UsageError(
+                f"the run in {self.path} has {step:,} steps already, so nothing is left to train with other settings; "
+                f"ask for --steps of {step + self._setup.config.batch_size} or more"
+            )
+
+    @processes.in_first
+    def _continue(self, step: int, ended: bool, old: Provenance | None) -> list[Row]:
+        rows = _keep_rows_until(self.path, step, self._say)
+        if not ended:
+            self._record_changes(step, old)
+            write_settings(self.path, self._setup)
+        if missing := missing_rows(self._setup.config, self._changes, rows, step):
+            self._say(f"{self.path / 'metrics.jsonl'} lacks {missing}; tables are made of the others")
+        return rows
+
+    def _record_changes(self, step: int, old: Provenance | None) -> None:
+        """Makes changes.jsonl say what has changed since the checkpoint after `step`, which belongs to `old`."""
+        kept = [row for row in self._changes if row["step"] < step + (old is None)]
+        changed = (old or self._run).differences(self._provenance)
+        if changed:
+            self._say(f"from step {step:,} on: {', '.join(f'{name} {change}' for name, change in changed.items())}")
+            kept.append({"step": step, "changed": changed})
+        if kept != self._changes:
+            replace_text(self.path / "changes.jsonl", _lines(kept))
+        self._changes = kept
+
+    @processes.in_first
+    def open_loggers(self, names: Sequence[str], step: int) -> None:
+        """Opens metrics.jsonl, and what `names` says besides, for the rows after `step`."""
+        for logger in open_loggers(names, self.path, self._setup.config, step):
+            self._loggers.append(self._open.enter_context(contextlib.closing(logger)))
+
+    @processes.in_first
+    def log(self, rows: list[Row]) -> None:
+        """Writes a chunk's rows into files that are open, so never into those of another run.
+
+        Raises:
+          OSError: they cannot be written.
+        """
+        for logger in self._loggers:
+            logger.write(rows)
+
+    def save(self, step: int, tree: Any) -> None:
+        """Writes a checkpoint, as `Checkpoints.save`.
+
+        Raises:
+          Gone: the folder is no longer the one that was claimed.
+        """
+        self.check()
+        self.checkpoints.save(step, tree, self._provenance)
+
+    def rescue(self, step: int, tree: Any) -> pathlib.Path:
+        """Saves the run in a new folder beside the one that is gone, whole but for older checkpoints.
+
+        Returns:
+          its path.
+
+        Raises:
+          OSError: it cannot be written.
+        """
+        path = self._make_rescue()
+        with contextlib.closing(Checkpoints(path)) as checkpoints:
+            checkpoints.save(step, tree, self._provenance)
+        return path
+
+    @processes.in_first
+    def _make_rescue(self) -> pathlib.Path:
+        assert self._rescue
+        of, inside = self._rescue.of, self._home.relative_to(self._rescue.of)
+        tops = (of.with_name(f"{of.name}-rescued{end}") for end in ("", *(f"-{i}" for i in range(2, 10**6))))
+        top = next(top for top in tops if not (top / inside).exists())
+        (top / inside).mkdir(parents=True)
+        for name, text in self._rescue.files.items():
+            (top / name).parent.mkdir(parents=True, exist_ok=True)
+            replace_text(top / name, text)
+        write_settings(top / inside, self._setup)
+        rows = (logger.text() for logger in self._loggers if isinstance(logger, Jsonl))
+        replace_text(top / inside / "metrics.jsonl", "".join(rows))
+        if self._changes:
+            replace_text(top / inside / "changes.jsonl", _lines(self._changes))
+        return top / inside
 
 
 def create(setup: Setup) -> pathlib.Path:
@@ -52,7 +320,7 @@ def create(setup: Setup) -> pathlib.Path:
             raise UsageError(f"cannot write into {out.parent}: {error.strerror}; choose an --out") from None
 
 
-def check_out(out: pathlib.Path, resume: bool) -> None:
+def _check_path(out: pathlib.Path, resume: bool) -> None:
     """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
 
     Raises:
@@ -65,84 +333,7 @@ def check_out(out: pathlib.Path, resume: bool) -> None:
         raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
 
 
-def check_content(out: pathlib.Path, setup: Setup, resume: bool, say: Say, change: bool = False) -> None:
-    """Whether a claimed folder is empty, or holds the run to resume.
-
-    Args:
-      change: the settings may differ from the run's, all but `IDENTITY`.
-
-    Raises:
-      UsageError: it does not, or the run was made with other settings or another physics engine.
-    """
-    existing = out / "config.toml"
-    if resume:
-        _same_settings(load_config(existing), setup.config, out, change)
-        _same_machine(out, setup, say)
-    elif existing.exists() or any(path.name not in BEFORE_START and path.name[0] != "." for path in out.iterdir()):
-        what = "another run" if existing.exists() else "other files"
-        raise UsageError(f"{out} already holds {what}; choose another --out, or --resume to continue the run")
-
-
-def _same_settings(old: Config, new: Config, out: pathlib.Path, change: bool) -> None:
-    """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
-    changed = {name: x for name, x in differences(old, new).items() if name in IDENTITY or not change}
-    if changed.keys() - {"steps"}:
-        advice = "resume it unchanged (only --steps may grow), add --change to continue with the new ones"
-        if change:
-            advice = f"--change cannot change {', '.join(changed)}; leave them as they are"
-        difference = "".join(f"\n  {name}: {x}" for name, x in changed.items() if name != "steps")
-        raise UsageError(
-            f"the run in {out} was made with other settings; {advice}, or choose another --out:{difference}"
-        )
-
-
-def _changed(out: pathlib.Path, config: Config) -> dict[str, str]:
-    """What `config` changes of the run's settings, all but the steps: {name: 'old -> new'}."""
-    return {x: y for x, y in differences(load_config(out / "config.toml"), config).items() if x != "steps"}
-
-
-def check_unchanged(out: pathlib.Path, step: int, config: Config) -> None:
-    """Whether a run that has ended after `step` is asked for as it is.
-
-    Raises:
-      UsageError: its settings changed, and no update is left to make with them.
-    """
-    if _changed(out, config):
-        raise UsageError(
-            f"the run in {out} has {step:,} steps already, so nothing is left to train with other settings; "
-            f"ask for --steps of {step + config.batch_size} or more"
-        )
-
-
-def record_changes(out: pathlib.Path, step: int, config: Config, say: Say) -> None:
-    """Appends what `config` changes of the run's settings after `step` to changes.jsonl, if anything."""
-    if changed := _changed(out, config):
-        with (out / "changes.jsonl").open("a") as file:
-            file.write(json.dumps({"step": step, "changed": changed}) + "\n")
-        say(f"from step {step:,} on: {', '.join(f'{name} {change}' for name, change in changed.items())}")
-
-
-def _same_machine(out: pathlib.Path, setup: Setup, say: Say) -> None:
-    """Refuses another engine or other random numbers; says which versions changed, which costs the last bits."""
-    old = _recorded_versions(out)
-    if old is None:
-        say(f"{out / 'versions.json'} cannot be read: the engine and the versions of the run are unknown")
-        return
-    new = versions(setup)
-    if old.get("engine", new["engine"]) != new["engine"]:
-        raise UsageError(
-            f"the run in {out} was simulated by engine '{old['engine']}', but physics = {setup.config.physics} means "
-            f"'{new['engine']}' on this {new['device']}, whose numbers differ; resume it where '{old['engine']}' runs, "
-            "or choose another --out"
-        )
-    plain = [name for name in new if name in old and not isinstance(new[name], dict)]
-    changed = [f"{name} {old[name]} -> {new[name]}" for name in plain if old[name] != new[name]]
-    changed += numerics.changes(old, new, out)
-    if changed:
-        say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
-
-
-def _recorded_versions(out: pathlib.Path) -> dict[str, Any] | None:
+def recorded_versions(out: pathlib.Path) -> dict[str, Any] | None:
     """What versions.json holds; None if it cannot be read."""
     try:
         return dict(json.loads((out / "versions.json").read_text()))
@@ -164,7 +355,7 @@ def write_settings(out: pathlib.Path, setup: Setup) -> None:
     replace_text(out / "config.toml", to_toml(setup.config))
 
 
-def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
+def _keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
     """Drops the rows after the checkpoint that the run continues from, and a line that was cut off.
 
     If there is no checkpoint, all rows are kept under another name.
@@ -188,12 +379,13 @@ def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
     for row in rows:
         _check_number(metrics, row, "seed")
         _check_number(metrics, row, "seconds")
-    last = rows[-1]["step"] if rows else 0
-    if last < step:
-        say(f"{metrics} ends at step {last:,}, but the checkpoint is of step {step:,}: the rows between are lost")
     if metrics.exists():
-        replace_text(metrics, "".join(json.dumps(row) + "\n" for row in rows))
+        replace_text(metrics, _lines(rows))
     return rows
+
+
+def _lines(rows: Sequence[Row]) -> str:
+    return "".join(json.dumps(row) + "\n" for row in rows)
 
 
 def _check_number(metrics: pathlib.Path, row: Row, name: str) -> None:
@@ -237,7 +429,7 @@ def load_saved(
     """A run's settings, the step of its newest whole checkpoint, and all that it holds: `last` and `best`.
 
     Raises:
-      UsageError: the folder holds no run, or no checkpoint.
+      UsageError: the folder holds no run or no checkpoint, or its config.toml is not that of the checkpoint.
     """
     if not (folder / "config.toml").is_file():
         raise UsageError(f"{folder} is not a run folder: {_what_it_is(folder)}")
@@ -245,11 +437,29 @@ def load_saved(
         raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
-    checkpoints = Checkpoints(folder, read_only=True)
-    try:
-        with numerics.keys_of(_recorded_versions(folder) or {}):
-            like = state_like(setup)
-            step, saved = checkpoints.load({"last": like, "best": jax.eval_shape(initial_best, like)}, warn)
-    finally:
-        checkpoints.close()
-    return setup, step, saved
+    saved = _newest(folder, warn)
+    if edited := unexplained(saved, config, read_changes(folder)):
+        raise UsageError(
+            f"{folder / 'config.toml'} does not say what the checkpoint after {saved.step:,} steps was trained with; "
+            f"mend that file, or move the checkpoint elsewhere if it is of another run:{listed(edited)}"
+        )
+    with numerics.keys_of(recorded_versions(folder) or {}):
+        like = state_like(setup)
+        return setup, saved.step, unpack(saved.packed, {"last": like, "best": jax.eval_shape(initial_best, like)})
+
+
+_newest = processes.in_first(newest)
+
+
+def unexplained(saved: Saved, config: Config, changes: Sequence[Row]) -> dict[str, str]:
+    """{setting: 'its value in the checkpoint -> its value in `config`'} of what `changes` after it do not explain."""
+    if saved.provenance is None:
+        return {}
+    found = saved.provenance.differences(Provenance(config))
+    made = {name: x for row in changes if row["step"] >= saved.step for name, x in row["changed"].items()}
+    return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
+
+
+def listed(changed: Mapping[str, str]) -> str:
+    """Settings and what differs in them, a line each."""
+    return "".join(f"\n  {name}: {x}" for name, x in changed.items())

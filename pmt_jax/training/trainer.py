@@ -10,6 +10,7 @@ import pathlib
 import shlex
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,12 +24,13 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import claims, health, jobs, processes, run_folder
-from .checkpoint import Checkpoints, has_checkpoint
+from . import claims, health, jobs, processes
+from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
-from .loggers import Logger, Profile, check_loggers, open_loggers
+from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, duration
+from .run_folder import MATMUL_PRECISION, Rescue, RunFolder, initial_best
 from .signals import Interrupts
 
 CHECKPOINT_SECONDS = 300.0
@@ -51,6 +53,7 @@ def train(
     warm_start: WarmStart = lambda setup: None,
     debug: bool = False,
     change: bool = False,
+    rescue: Rescue | None = None,
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -67,15 +70,16 @@ def train(
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
+      rescue: where the run is saved if its folder is gone; beside it if None.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
-      trial) broke, `debug` found something or the folder could not be written any more.
+      trial) broke, `debug` found something, or the folder is gone or could not be written any more.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
     """
-    jax.config.update("jax_default_matmul_precision", run_folder.MATMUL_PRECISION)
+    jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     check_loggers(loggers)
     jobs.check(config, workers, {"--devices": count, "--debug": debug, "--profile": profile})
     if not processes.is_first():
@@ -85,14 +89,15 @@ def train(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
         setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
-        begin = None if resume and out and has_checkpoint(out) else warm_start(setup)
-        out = processes.by_first(lambda: _claim_folder(stack, setup, out, resume, say, change))
-        _describe(setup, out, say)
+        folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
+        folder.claim(out, resume, change)
+        begin = None if folder.saved else warm_start(setup)
+        _describe(setup, folder.path, say)
         if cache:
             use_cache()
         state, programs = (jobs.start if workers > 1 else compile_run)(setup, say)
         stack.callback(programs.close)
-        trainer = Trainer(setup, programs, begin(state) if begin else state, out, say)
+        trainer = Trainer(setup, programs, begin(state) if begin else state, folder, say)
         return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
 
 
@@ -116,6 +121,9 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
         begin()
         trainer.train(interrupts)
         stack.close()
+    except claims.Gone as gone:
+        trainer.say(trainer.rescue(gone))
+        return 1
     except NotFinite as found:
         trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
         return 1
@@ -128,18 +136,6 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
         trainer.say(trainer.write_failure(error))
         return 1
     return trainer.finish()
-
-
-def _claim_folder(
-    stack: contextlib.ExitStack, setup: Setup, out: pathlib.Path | None, resume: bool, say: Say, change: bool
-) -> pathlib.Path:
-    """The run folder, which belongs to this process until `stack` closes."""
-    created = out is None
-    out = out or run_folder.create(setup)
-    run_folder.check_out(out, resume)
-    stack.enter_context(claims.claim(out, created))
-    run_folder.check_content(out, setup, resume, say, change)
-    return out
 
 
 def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
@@ -177,16 +173,17 @@ class Trainer:
     """
 
     def __init__(
-        self, setup: Setup, programs: Programs, state: LearnerState, out: pathlib.Path, say: Say = say
+        self, setup: Setup, programs: Programs, state: LearnerState, folder: RunFolder, say: Say = say
     ) -> None:
         """Begins at the first `state`; `open` may replace it by a saved one."""
-        self.setup, self.config, self.programs, self.out, self.say = setup, setup.config, programs, out, say
-        self.state, self.best = state, run_folder.initial_best(state)
+        self.setup, self.config, self.programs, self.folder, self.say = setup, setup.config, programs, folder, say
+        self.state, self.best = state, initial_best(state)
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
         self.total = self.config.num_updates * self.config.batch_size
         self._signal = 0
-        self._loggers: list[Logger] = []
+        self._progress: Progress | None = None
+        self._is_open = False
 
     def open(
         self,
@@ -196,35 +193,26 @@ class Trainer:
         profile: pathlib.Path | None,
     ) -> None:
         """Opens what is written to until `stack` closes, and continues from the newest checkpoint if `resume`."""
-        if not resume:
-            processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
-        self.checkpoints = stack.enter_context(contextlib.closing(Checkpoints(self.out)))
         if resume:
             self._restore()
-            if self.step < self.total:
-                processes.by_first(lambda: run_folder.record_changes(self.out, self.step, self.config, self.say))
-                processes.by_first(lambda: run_folder.write_settings(self.out, self.setup))
-            else:
-                run_folder.check_unchanged(self.out, self.step, self.config)
-        processes.by_first(lambda: self._open_loggers(stack, loggers))
+        else:
+            self.folder.begin()
+        self.folder.open_loggers(loggers, self.step)
+        if processes.is_first():
+            self._progress = stack.enter_context(contextlib.closing(Progress(self.total, self.step)))
         self._profile = stack.enter_context(contextlib.closing(Profile(profile)))
-
-    def _open_loggers(self, stack: contextlib.ExitStack, names: Sequence[str]) -> None:
-        for logger in open_loggers(names, self.out, self.config, self.step):
-            self._loggers.append(stack.enter_context(contextlib.closing(logger)))
-        self._progress = stack.enter_context(contextlib.closing(Progress(self.total, self.step)))
+        self._is_open = True
 
     def _restore(self) -> None:
-        """Continues from the newest checkpoint, if there is one, and deletes later traces of the run."""
-        saved = {"last": self.state, "best": self.best}
-        if self.checkpoints.steps():
-            self.step, saved = self.checkpoints.load(saved, self.say)
-        self.checkpoints.forget_after(self.step)
-        rows = processes.by_first(lambda: run_folder.keep_rows_until(self.out, self.step, self.say))
+        """Continues from the newest checkpoint, if there is one."""
+        tree = {"last": self.state, "best": self.best}
+        if saved := self.folder.saved:
+            self.step, tree = saved.step, unpack(saved.packed, tree)
+        rows = self.folder.resume(self.step, ended=self.step >= self.total)
         self.say(f"resuming after {self.step:,} steps")
         self.seconds = rows[-1]["seconds"] if rows else 0.0
-        self.state = sharding.place(self.setup.mesh, saved["last"])
-        best = saved["best"]
+        self.state = sharding.place(self.setup.mesh, tree["last"])
+        best = tree["best"]
         self.best = dataclasses.replace(best, state=sharding.place(self.setup.mesh, best.state))
         if self.setup.debug:  # a seed that broke goes on from its last finite state, to be looked at
             return
@@ -254,6 +242,7 @@ class Trainer:
             self.seconds = before + time.monotonic() - begin
             self._log(rows)
             self._keep_best(rows)
+            self.folder.check()
             if processes.agree(time.monotonic() - saved > CHECKPOINT_SECONDS):
                 self._save()
                 saved = time.monotonic()
@@ -309,13 +298,9 @@ class Trainer:
     def _log(self, rows: list[Row]) -> None:
         for row in rows:
             row["seconds"] = round(self.seconds, 3)
-
-        def write() -> None:
-            for logger in self._loggers:
-                logger.write(rows)
+        self.folder.log(rows)
+        if self._progress:
             self._progress.show(rows, self._rate)
-
-        processes.by_first(write)
 
     def _keep_best(self, rows: list[Row]) -> None:
         """Keeps each seed's state if it is the best so far, by the evaluation if there is one, else by training."""
@@ -330,8 +315,13 @@ class Trainer:
             state = self.programs.take(improved, self.best.state, self.state)
             self.best = Best(state, np.where(improved, reward, best_reward), np.where(improved, cost, best_cost))
 
+    @property
+    def _tree(self) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {"last": self.state, "best": self.best}
+
     def _save(self) -> None:
-        self.checkpoints.save(self.step, {"last": self.state, "best": self.best})
+        self.folder.save(self.step, self._tree)
 
     # -----------------------------------------------------------------------------------------------------------------
     # The end
@@ -343,7 +333,9 @@ class Trainer:
             self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self.command}")
             return 128 + self._signal
         if not self.all_broken:
-            next_step = "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.out)])}"
+            next_step = (
+                "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.folder.path)])}"
+            )
             self.say(f"done: {self.step:,} steps in {duration(self.seconds)}{next_step}")
         # A trial that diverges is a result of its sweep, lost contacts are not.
         overflow = any(health.NO_ROOM in reason for reason in self.broken.values())
@@ -355,25 +347,43 @@ class Trainer:
         for reason in reasons[:MOST_REASONS]:
             self.say(f"stopped: {reason}")
         if len(reasons) > MOST_REASONS:
-            self.say(f"stopped: {len(reasons) - MOST_REASONS} more, see `broken` in {self.out / 'metrics.jsonl'}")
+            self.say(
+                f"stopped: {len(reasons) - MOST_REASONS} more, see `broken` in {self.folder.path / 'metrics.jsonl'}"
+            )
         if self.broken and not self.setup.trials:
             seeds = ", ".join(str(self.config.seed + i) for i in sorted(self.broken))
-            self.say(f"seed(s) {seeds} broke; the last finite state and the best of every seed are saved in {self.out}")
+            where = self.folder.path
+            self.say(f"seed(s) {seeds} broke; the last finite state and the best of every seed are saved in {where}")
+
+    def rescue(self, gone: claims.Gone) -> str:
+        """Saves a run beside its folder that is gone; returns what happened and how to continue."""
+        if not self._is_open:
+            return f"stopped: {gone}; nothing new was trained yet"
+        try:
+            saved = self.folder.rescue(self.step, self._tree)
+        except OSError as error:
+            return f"stopped: {gone}; what was trained is lost, as no folder beside it can be written: {error.strerror}"
+        return f"stopped: {gone}; saved as of step {self.step:,} in {saved}. Continue with: {self._continuing(saved)}"
 
     def write_failure(self, error: OSError) -> str:
         """What to do about a full disk, a quota, or a share that is gone."""
-        begun = (self.out / "config.toml").is_file()
+        begun = (self.folder.path / "config.toml").is_file()
         then = f"continue: {self.command}" if begun else "train again into another --out"
         why = error.strerror or error
-        return f"stopped: cannot write into {self.out}: {why}. What was saved is whole; make room and {then}"
+        return f"stopped: cannot write into {self.folder.path}: {why}. What was saved is whole; make room and {then}"
 
     @property
     def command(self) -> str:
         """What continues the run."""
+        return self._continuing(self.folder.path)
+
+    def _continuing(self, out: pathlib.Path) -> str:
+        """What continues the run in `out`."""
+        moved = out != self.folder.path
         if self.setup.trials:
-            return "the same command"
+            return "the same command" + " with the first part of that path as --out" * moved
         if jax.process_count() > 1:
-            return "the same command with --resume"
+            return "the same command with --resume" + f" --out {shlex.quote(str(out))}" * moved
         split = f" --devices {self.setup.mesh.size}" if self.setup.mesh else ""
         split += f" --jobs {self.setup.jobs}" if self.setup.jobs > 1 else ""
-        return load.resume_command(str(self.out)) + split
+        return load.resume_command(str(out)) + split

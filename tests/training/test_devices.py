@@ -153,8 +153,8 @@ def test_a_run_makes_the_devices_of_a_cpu_that_it_asks_for(cli, tmp_path: pathli
 # Two processes
 
 
-def together(out: pathlib.Path, *arguments: object, slurm: bool = False) -> list[tuple[int, str, str]]:
-    """The same command in two processes: exit code, stdout and stderr of each."""
+def both(out: pathlib.Path, *arguments: object, slurm: bool = False) -> list[subprocess.Popen[str]]:
+    """The same command in two processes."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = str(free.getsockname()[1])
@@ -168,6 +168,12 @@ def together(out: pathlib.Path, *arguments: object, slurm: bool = False) -> list
         env = environment(**(step if slurm else {}))
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         processes.append(subprocess.Popen(command, env=env, text=True, **pipes))
+    return processes
+
+
+def together(out: pathlib.Path, *arguments: object, slurm: bool = False) -> list[tuple[int, str, str]]:
+    """The same command in two processes: exit code, stdout and stderr of each."""
+    processes = both(out, *arguments, slurm=slurm)
     said = [process.communicate(timeout=300) for process in processes]
     return [(process.returncode, *texts) for process, texts in zip(processes, said, strict=True)]
 
@@ -190,6 +196,22 @@ def assert_close(out: pathlib.Path, other: pathlib.Path) -> None:
         assert first.keys() == second.keys()
         for path, x in first.items():
             np.testing.assert_allclose(x, second[path], rtol=1e-3, atol=1e-5, err_msg=path)
+
+
+@pytest.mark.full
+def test_two_processes_save_a_run_whose_folder_is_gone(tmp_path: pathlib.Path, cli):
+    out, saved = tmp_path / "two", tmp_path / "two-rescued"
+    first, second = both(out, *ARGUMENTS, "--steps", 10**7)
+    assert first.stdout and any(line.startswith("steps ") for line in first.stdout)
+    out.rename(tmp_path / "elsewhere")
+    text, _ = first.communicate(timeout=300)
+    other_text, _ = second.communicate(timeout=300)
+    assert first.returncode == second.returncode == 1 and "pmt" not in other_text
+    assert f"stopped: {out} was deleted, renamed or replaced" in text and f"in {saved}. Continue with" in text
+    assert not out.exists()
+    steps = rows(saved)[-1]["step"]
+    code, text, _ = cli(*ARGUMENTS, "--steps", steps + 80, "--out", saved, "--resume")
+    assert code == 0 and f"resuming after {steps:,} steps" in text
 
 
 @pytest.mark.full

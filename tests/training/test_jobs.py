@@ -66,6 +66,21 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
 
 
 @pytest.mark.full
+def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: pathlib.Path, cli):
+    process = begun(tmp_path / "run")
+    (tmp_path / "run").rename(tmp_path / "elsewhere")
+    text, err = process.communicate(timeout=120)
+    said, saved = text.splitlines()[-1], tmp_path / "run-rescued"
+    assert process.returncode == 1 and not err and said.startswith(f"stopped: {tmp_path / 'run'} was deleted, renamed")
+    assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --jobs 2")
+    assert not (tmp_path / "run").exists()
+    step = rows(saved)[-1]["step"]
+    assert cli(*JOBS, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
+    assert cli(*JOBS, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert_same_run(saved, tmp_path / "uninterrupted")
+
+
+@pytest.mark.full
 def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathlib.Path, cli):
     process = begun(tmp_path / "run")
     first, second = psutil.Process(process.pid).children()

@@ -98,11 +98,11 @@ def test_rows_that_cannot_be_written_stop_the_run(tmp_path: pathlib.Path, cli, m
 
 def test_a_run_of_more_steps_than_fit_into_int32_is_resumed(copy: pathlib.Path, cli):
     step, updates = 3_000_000_000, 30_000_000
-    _, _, saved = run_folder.load_saved(copy)
+    setup, _, saved = run_folder.load_saved(copy)
     for state in (saved["last"], saved["best"].state):
         object.__setattr__(state, "update", jnp.full_like(state.update, updates))
     checkpoints = checkpoint.Checkpoints(copy)
-    checkpoints.save(step, saved)
+    checkpoints.save(step, saved, checkpoint.Provenance(setup.config))
     checkpoints.close()
     code, text, _ = cli("train", *ARGUMENTS, "--steps", step + 400, "--out", copy, "--resume")
     assert code == 0 and "resuming after 3,000,000,000 steps" in text and "done: 3,000,000,400 steps" in text
@@ -165,7 +165,7 @@ def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli
     metrics.write_text(text[: len(text) // 2])
     code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 200)
     assert code == 0 and "changed since the run began: jax 0.1 -> " in text
-    assert f"{metrics} ends at step 800, but the checkpoint is of step 1,600: the rows between are lost" in text
+    assert f"{metrics} lacks 8 of 16 rows up to step 1,600: 4 of seed 0 (between steps 1,000 and 1,600), 4 of" in text
     steps = [row["step"] for row in rows(copy)]
     assert steps[-1] == STEPS + 200 and 1000 not in steps
 

@@ -1,0 +1,195 @@
+"""A folder that is deleted, renamed or replaced while a run trains in it: the run is saved, no other is touched."""
+
+from __future__ import annotations
+
+import pathlib
+import shlex
+import shutil
+from collections.abc import Callable
+
+import pytest
+
+from pmt_jax.training import claims, loggers, trainer
+from runs import ARGUMENTS, STEPS, assert_same_run, rows
+
+RUN = ("train", *ARGUMENTS, "--steps", STEPS)
+
+
+def content(folder: pathlib.Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def deleted(folder: pathlib.Path) -> None:
+    shutil.rmtree(folder)
+
+
+def renamed(folder: pathlib.Path) -> None:
+    folder.rename(folder.with_name("elsewhere"))
+
+
+def emptied(folder: pathlib.Path) -> None:
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+def copied(folder: pathlib.Path) -> None:
+    """As by a tool that restores or moves to another disk: the same names and bytes, but other files."""
+    renamed(folder)
+    shutil.copytree(folder.with_name("elsewhere"), folder)
+
+
+def unclaimed(folder: pathlib.Path) -> None:
+    (folder / ".claim").unlink()
+
+
+def without_rows(folder: pathlib.Path) -> None:
+    (folder / "metrics.jsonl").unlink()
+
+
+def rows_edited(folder: pathlib.Path) -> None:
+    """As an editor saves: a new file takes the name."""
+    (folder / "new").write_text((folder / "metrics.jsonl").read_text()[:-100])
+    (folder / "new").rename(folder / "metrics.jsonl")
+
+
+def claimed_by_another(folder: pathlib.Path) -> None:
+    emptied(folder)
+    (folder / ".claim").write_text('{"pid": 1, "host": "node7", "since": "2026-01-01 00:00:00"}')
+    (folder / "config.toml").write_text("# another run's\n")
+
+
+def with_its_parent(folder: pathlib.Path) -> None:
+    shutil.rmtree(folder.parent)
+
+
+OF_A_CLAIM = (deleted, renamed, emptied, copied, unclaimed, claimed_by_another, with_its_parent)
+HOW = (*OF_A_CLAIM, without_rows, rows_edited)
+
+
+@pytest.fixture
+def happens(monkeypatch: pytest.MonkeyPatch):
+    """Makes something happen to a folder when a run has written its rows after `step`."""
+
+    def arrange(what: Callable[[pathlib.Path], None], folder: pathlib.Path, step: int) -> None:
+        write = loggers.Jsonl.write
+
+        def write_and(self: loggers.Jsonl, some: list) -> None:
+            write(self, some)
+            if some[0]["step"] == step and folder.exists():
+                what(folder)
+
+        monkeypatch.setattr(loggers.Jsonl, "write", write_and)
+
+    return arrange
+
+
+QUICK = ((deleted, 600), (renamed, STEPS), (claimed_by_another, 600), (without_rows, 600))
+REST = ((what, step) for what in HOW for step in (600, STEPS) if (what, step) not in QUICK)
+
+
+@pytest.mark.parametrize(("what", "step"), [*QUICK, *(pytest.param(*x, marks=pytest.mark.full) for x in REST)])
+def test_a_run_whose_folder_is_gone_is_saved_beside_it_and_goes_on_bit_for_bit(
+    what: Callable, step: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, happens, monkeypatch
+):
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    out = tmp_path / "runs" / "a b"
+    happens(what, out, step)
+    seen: list[dict[str, bytes]] = []
+    monkeypatch.setattr(claims.Gone, "__init__", lambda self, *_: seen.append(content(out) if out.exists() else {}))
+    code, text, err = cli(*RUN, "--out", out)
+    assert code == 1 and not err and "Traceback" not in text
+    said, saved = text.splitlines()[-1], out.with_name("a b-rescued")
+    assert said.startswith("stopped: ") and f"saved as of step {step:,} in {saved}. Continue with: pmt " in said
+    left = content(out) if out.exists() else {}
+    ours = {".claim"} if what in (without_rows, rows_edited) else set()  # there the folder is still the run's
+    assert left == {name: data for name, data in seen[0].items() if name not in ours}  # nothing was written after it
+    monkeypatch.undo()
+    assert [row["step"] for row in rows(saved)][-1] == step
+    assert cli(*shlex.split(said.partition("Continue with: pmt ")[2]), "--no-cache")[0] == 0
+    assert_same_run(saved, whole)
+
+
+def test_two_that_go_do_not_overwrite_each_other(tmp_path: pathlib.Path, cli, happens):
+    out = tmp_path / "run"
+    happens(deleted, out, 200)
+    for name in ("run-rescued", "run-rescued-2"):
+        code, text, _ = cli(*RUN, "--out", out)
+        assert code == 1 and f"in {tmp_path / name}. Continue" in text
+    assert {path.name for path in tmp_path.iterdir()} == {"run-rescued", "run-rescued-2"}
+
+
+def test_a_run_that_goes_on_says_so_before_it_writes(copy: pathlib.Path, cli, monkeypatch):
+    """The folder may go while the program compiles."""
+    compile_run = trainer.compile_run
+
+    def compile_and_replace(*arguments):
+        result = compile_run(*arguments)
+        copied(copy)
+        return result
+
+    monkeypatch.setattr(trainer, "compile_run", compile_and_replace)
+    (copy / "checkpoints" / "2000").mkdir()  # what it would set aside
+    before = content(copy)
+    code, text, _ = cli(*RUN, "--out", copy, "--resume", "--steps", STEPS + 200)
+    assert code == 1 and f"stopped: {copy} was deleted, renamed or replaced" in text and "nothing new" in text
+    assert content(copy) == before | {".claim": (copy / ".claim").read_bytes()}
+    assert (copy / "checkpoints" / "2000").is_dir() and not copy.with_name("copy-rescued").exists()
+
+
+def test_no_place_beside_it(tmp_path: pathlib.Path, cli, happens, monkeypatch):
+    out = tmp_path / "run"
+    happens(deleted, out, 200)
+
+    def full(self: pathlib.Path, *_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    begin = loggers.Jsonl.write
+    monkeypatch.setattr(
+        loggers.Jsonl, "write", lambda self, some: (begin(self, some), monkeypatch.setattr(pathlib.Path, "mkdir", full))
+    )
+    code, text, err = cli(*RUN, "--out", out)
+    assert code == 1 and not err and text.splitlines()[-1].endswith("No space left on device")
+
+
+@pytest.mark.parametrize("what", OF_A_CLAIM)
+def test_a_claim_ends_without_touching_the_folder_that_took_its_place(what: Callable, tmp_path: pathlib.Path):
+    out = tmp_path / "runs" / "x"
+    with claims.claim(out):
+        assert claims.is_held(out)
+        what(out)
+        assert not claims.is_held(out)
+        before = content(tmp_path)
+    assert content(tmp_path) == before and not claims.is_held(out)
+
+
+def test_a_program_of_a_sweep_is_saved_beside_the_sweep_and_goes_on_there(tmp_path: pathlib.Path, cli, happens):
+    words = ("sweep", "lane", *ARGUMENTS[1:11], "--method", "mappo_l", "--steps", 600, "--no-cache")
+    words = (*words, "--set", "clip=0.1,0.2", "--seeds", 2)
+    out, other = tmp_path / "sweep", tmp_path / "other"
+    assert cli(*words, "--out", other)[0] == 0
+
+    def replaced(_: pathlib.Path) -> None:
+        out.rename(tmp_path / "moved")
+        shutil.copytree(other, out)
+
+    happens(replaced, out / ".group-1" / "run", 400)
+    before = content(other)
+    code, text, err = cli(*words, "--out", out)
+    assert code == 1 and not err and f"saved as of step 400 in {tmp_path / 'sweep-rescued'}/.group-1/run" in text
+    assert content(out) == before
+    code, text, _ = cli(*words, "--out", tmp_path / "sweep-rescued")
+    assert code == 0 and "resuming after 400 steps" in text
+    for name in ("clip=0.1", "clip=0.2"):
+        assert_same_run(tmp_path / "sweep-rescued" / name, other / name)
+
+
+def test_what_follows_in_a_sweep_that_is_gone_is_not_trained(tmp_path: pathlib.Path, cli, monkeypatch):
+    from pmt_jax.studies import sweep
+
+    words = ("sweep", "lane", *ARGUMENTS[1:11], "--method", "mappo_l", "--steps", 200, "--no-cache")
+    out = tmp_path / "sweep"
+    cut = sweep._cut
+    monkeypatch.setattr(sweep, "_cut", lambda *a: (cut(*a), emptied(out)))
+    code, text, err = cli(*words, "--set", "activation=relu,tanh", "--out", out)
+    assert code == 1 and not err and f"stopped: {out} was deleted, renamed or replaced" in text
+    assert not list(out.iterdir())
