@@ -105,7 +105,7 @@ STATED: dict[str, dict[str, str]] = {
         "updates": "60",
         "first seeds": "800 840",
         "a setting": "0.0045",
-        "p of a pair of fear_probe_ten_million_h200.json, not corrected": ".022",
+        "p of pairs of fear_probe_ten_million_h200.json, not corrected": ".022 .011 .024",
         "multipliers of the stored curves of the study and its rounds": "2.96 1.11",
     },
     "results/study_fourth.md": {
