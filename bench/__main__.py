@@ -22,6 +22,7 @@ from typing import Any
 
 from pmt_jax.cli.parser import Parser, command, refuse_unknown, whole
 from pmt_jax.cli.process import answer
+from pmt_jax.studies import plot
 
 from . import compare, records, render, runner
 from .cases import BENCHES
@@ -75,6 +76,7 @@ def _add_showing(commands: Any) -> None:
     stored.add_argument("folders", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
     stored.add_argument("-o", "--out", type=pathlib.Path, required=True, help="a JSON file")
     stored.add_argument("--same-end", action="store_true", help="read all at the last step that every run reached")
+    stored.add_argument("--points", type=whole(1), default=plot.POINTS, help="the most of a curve (default 100)")
     published = command(commands, "publish", _publish, "make pretrained policies of runs, and report their metrics")
     published.add_argument(
         "folders", nargs="*", type=pathlib.Path, metavar="RUN", help="run folders, or hub:NAME to measure it anew"
@@ -125,7 +127,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _store(arguments: argparse.Namespace) -> int:
-    say(f"{runs.store(arguments.folders, arguments.out, arguments.same_end)} run(s) in {arguments.out}")
+    stored = runs.store(arguments.folders, arguments.out, arguments.same_end, arguments.points)
+    say(f"{stored} run(s) in {arguments.out}")
     return 0
 
 

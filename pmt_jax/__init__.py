@@ -1,4 +1,4 @@
-"""Safe multi-agent reinforcement learning with emotions, as one compiled program.
+"""Safe multi-agent reinforcement learning with emotions, compiled by JAX.
 
 Everything public is reached from here; importing the package imports neither JAX nor MuJoCo until something is used.
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
 import pathlib
 import tomllib
@@ -11,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from pmt_jax.config.methods import METHODS
+from pmt_jax.config.settings import Config
 from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
 from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import Row, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
-from pmt_jax.studies.statistics import iqm, mean_interval, u_test
+from pmt_jax.studies.statistics import holm, iqm, mean_interval, u_test
 from pmt_jax.tasks import columns
 
 from .. import records
@@ -29,22 +32,27 @@ TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_see
 # Stored as means over seeds.
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
+OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
+# Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
+OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
+TRUE = "true cost"  # also of steps that the team did not notice
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
-def store(folders: Sequence[pathlib.Path], out: pathlib.Path, same_end: bool = False) -> int:
+def store(folders: Sequence[pathlib.Path], out: pathlib.Path, same_end: bool = False, points: int = plot.POINTS) -> int:
     """Writes the run folders among and below `folders` into a JSON file; returns how many there are.
 
     Args:
       same_end: all runs are read as if they had ended at the last step that every one of them reached.
+      points: the most points of a curve, means over the rows between them. Tables come from all rows.
     """
     logs = read_all(folders)
     if same_end:
         end = min(log.steps[-1] for log in logs)
         logs = [log.until(end) for log in logs]
-    found = [_compact(run) | {"label": group.label} for group in groups(logs) for run in group.runs]
+    found = [_compact(run, points) | {"label": group.label} for group in groups(logs) for run in group.runs]
     out.write_text(json.dumps(found, separators=(",", ":")) + "\n")
     return len(found)
 
@@ -64,14 +72,14 @@ def load(file: pathlib.Path) -> list[Run]:
     return found
 
 
-def _compact(log: RunLog) -> Run:
+def _compact(log: RunLog, points: int) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
     the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost's curve, whose
     points count alike, and what the last evaluation found.
     """
-    found, (row,) = log.thinned(plot.POINTS), rows([log])
+    found, (row,) = log.thinned(points), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
     if "true_step_cost" in log.metrics:
         scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
@@ -177,6 +185,34 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[Row, str]]:
     return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
 
 
+def as_larger(files: pathlib.Path) -> str:
+    """The cells of the README's table for which `files`, whose names a + joins, have more seeds of the same settings.
+
+    Seeds of the README's table count too. Runs of one sample have the same task, method, settings and steps.
+    """
+    more = [run for name in files.stem.split("+") for run in load(files.with_stem(name))]
+    body = []
+    for name in HEADLINES:
+        for run in load(files.with_stem(name)):
+            sample = [run, *(other for other in more if _kind(other) == _kind(run))]
+            if len(sample) == 1:
+                continue
+            cost, reward = (np.concatenate([_scores(x)[of] for x in sample]) for of in ("cost", "reward"))
+            line = [f"`{run['task']}`", f"`{run['method']}`", str(cost.size), f"{number(reward.mean(), ',.4g')}"]
+            line += [f"{number(x, '.3g')}" for x in (cost.mean(), np.median(cost), cost.max(), run["cost_limit"])]
+            body.append([*line, f"{(cost <= run['cost_limit']).sum()} of {cost.size}"])
+    head = ("task", "method", "seeds", "reward", "cost", "median", "worst seed", "limit", "seeds within")
+    return markdown(head, body)
+
+
+def _kind(run: Run) -> tuple[Any, ...]:
+    """What runs of one sample have in common; settings that are newer than a run have what was done before."""
+    stored = tomllib.loads(run["config"])
+    every = {field.name: field.default for field in dataclasses.fields(Config)} | OLD | stored | stored.get("env", {})
+    same = {name: repr(value) for name, value in every.items() if name not in OF_A_SAMPLE | {"env"}}
+    return run["source"], max(run["steps"]), sorted(same.items())
+
+
 def as_ran(files: pathlib.Path) -> str:
     """What has run: a line a file of runs; a + joins the names of several files."""
     head = (
@@ -203,17 +239,23 @@ def as_ran(files: pathlib.Path) -> str:
 
 
 def as_pairs(file: pathlib.Path) -> str:
-    """Two-sided Mann-Whitney p of each pair of methods: above the diagonal of the reward, below it of the cost."""
+    """Two-sided Mann-Whitney p of each pair of methods: above the diagonal of the reward, below it of the cost.
+
+    A line below the table has the lowest p of each measure with Holm's correction over the pairs.
+    """
     found = in_order([_row(run) for run in load(file)])
+    p = {of: [[u_test(x.scores[of], y.scores[of]) for y in found] for x in found] for of in ("reward", "cost")}
     body = []
     for i, row in enumerate(found):
         line = [
-            "" if i == j else f"{u_test(row.scores[of], other.scores[of]):.3f}".lstrip("0")
-            for j, other in enumerate(found)
-            for of in ("reward" if i < j else "cost",)
+            "" if i == j else f"{p['reward' if i < j else 'cost'][i][j]:.3f}".lstrip("0") for j in range(len(found))
         ]
         body.append([f"`{row.label}`", *line])
-    return markdown(["", *(f"`{row.label}`" for row in found)], body)
+    pairs = list(itertools.combinations(range(len(found)), 2))
+    least = {of: min(holm([each[i][j] for i, j in pairs])) for of, each in p.items()}
+    words = " and ".join(f"{x:.3f} ({of})".lstrip("0") for of, x in least.items())
+    table = markdown(["", *(f"`{row.label}`" for row in found)], body)
+    return f"{table}\n\n*p of single pairs. The lowest with Holm's correction over the {len(pairs)} pairs: {words}.*"
 
 
 def _mean_std(*mean_and_std: float | None) -> str:
@@ -242,8 +284,13 @@ def _scores(run: Run) -> dict[str, np.ndarray]:
 
 
 def as_points(file: pathlib.Path) -> str:
-    """A line a run: what sets it apart, then means over seeds with 95 % intervals; in the order of METHODS."""
-    found, columns = load(file), ("cost", WHILE_TRAINING, "reward")
+    """A line a run: what sets it apart, then means over seeds with 95 % intervals; in the order of METHODS.
+
+    True costs have a column if a run did not notice all of them.
+    """
+    found = load(file)
+    hidden = any(run["table"].get(TRUE, run["table"]["cost"]) != run["table"]["cost"] for run in found)
+    columns = ("cost", *([TRUE] if hidden else ()), WHILE_TRAINING, "reward")
     found.sort(key=lambda run: (run["task"], list(METHODS).index(run["method"])))
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
@@ -291,6 +338,7 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "paper": as_paper,
     "summary": as_summary,
     "overview": as_overview,
+    "larger": as_larger,
     "ran": as_ran,
     "pairs": as_pairs,
 }

@@ -31,7 +31,6 @@ SHOWN |= {name: f"`{name}` {{}}" for name in ("num_envs", "init_fear", "max_grad
 SHOWN |= {name: f"`{name}` {{}}" for name in ("std_half_life", "std_decay_start", "limit_windup")}
 SHOWN |= {"sway": "the corridor moves, {}"}
 SHOWN |= {"cost_limit": "limit {}", "cost_value_clip": "`cost_value_clip` {}"}
-OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 LAST = 0.1  # share of the steps that count as the end
 
 
@@ -80,7 +79,7 @@ def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
 def settings(run: runs.Run) -> dict[str, Any]:
     """The run's settings; those that are newer than it have what was done before."""
     stored = _config(run["config"])
-    return {key: getattr(Config, key, "none") for key in SHOWN} | OLD | stored | (stored.get("env") or {})
+    return {key: getattr(Config, key, "none") for key in SHOWN} | runs.OLD | stored | (stored.get("env") or {})
 
 
 @functools.cache  # a table asks for the settings of a run many times
@@ -220,18 +219,56 @@ def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
     return markdown(["measure", "R4SG less MAPPO-L [90 %]", "bounds", "p", "answer"], body)
 
 
-def as_headline(file: pathlib.Path) -> str:
-    """MAPPO-L beside F4SG at every p, with the multiplier that both share."""
-    found = runs.load(file)
-    base = min(settings(run)["lambda_init"] for run in found)
+def as_probe(file: pathlib.Path) -> str:
+    """Probes of F4SG beside MAPPO-L with the same settings, at the same p and limit.
+
+    p of each comparison is corrected over all comparisons of the file, those of the three measures together.
+    """
+    found = sorted(runs.load(file), key=lambda run: (share(run), -_limit(run), _recipe(run), _rank(run)))
+    scores = [measures(run) for run in found]
+    pairs = [(i, j) for j, run in enumerate(found) if (i := _same_settings(found, run)) is not None]
+    order = ("training", "end", "reward")
+    p = holm([u_test(scores[j][name], scores[i][name]) for i, j in pairs for name in order])
+    corrected = {j: p[3 * k : 3 * k + 3] for k, (_, j) in enumerate(pairs)}
     body = []
-    for p in sorted({share(run) for run in found}, reverse=True):
-        same = [x for x in found if share(x) == p and settings(x)["lambda_init"] == base]
-        pair = [(x, measures(x)) for name in ("mappo_l", "f4sg") for x in same if x["method"] == name]
-        beyond = [unsafe(x, own) for x, own in pair]
-        ends, rewards = ([mean_sd(own[measure]) for _, own in pair] for measure in ("end", "reward"))
-        body.append([f"{p:g}", *(" / ".join(cell) for cell in (ends, rewards, beyond))])
-    return markdown(["p", "true cost, MAPPO-L / F4SG", "reward", "seeds beyond the limit"], body)
+    for j, (run, own) in enumerate(zip(found, scores, strict=True)):
+        line = [f"{share(run):g}", f"{_limit(run):g}", f"{NAMES[run['method']]}, {RECIPES[_recipe(run)]}"]
+        line += [mean_sd(own["training"]), mean_sd(own["end"]), f"{np.median(own['end']):.1f}", mean_sd(own["reward"])]
+        body.append([*line, unsafe(run, own), ", ".join(map(p_value, corrected[j])) if j in corrected else "-"])
+    head = ["p", "limit", "method, settings", "true cost per 1,000 steps, training", "true cost at the end", "median"]
+    return markdown([*head, "reward", "seeds beyond the limit", "corrected p: training, end, reward"], body)
+
+
+RECIPES = (
+    "as in the study",
+    "`max_grad_norm` inf",
+    "`cost_value_clip` inf",
+    "`cost_value_clip` and `max_grad_norm` inf",
+    "PID for tight limits",
+)
+
+
+def _recipe(run: runs.Run) -> int:
+    """Which of RECIPES the run has."""
+    mine = settings(run)
+    uncut, unclipped = (np.isinf(mine[name]) for name in ("max_grad_norm", "cost_value_clip"))
+    return 4 if mine["lambda_rule"] == "pid" else 2 * int(unclipped) + int(uncut)
+
+
+def _limit(run: runs.Run) -> float:
+    """The limit of true costs: the team notices a share of them."""
+    return run["cost_limit"] / share(run)
+
+
+def _rank(run: runs.Run) -> int:
+    return list(NAMES).index(run["method"])
+
+
+def _same_settings(found: Sequence[runs.Run], run: runs.Run) -> int | None:
+    """Where the MAPPO-L is that an F4SG is compared with."""
+    wanted = "mappo_l", share(run), _limit(run), _recipe(run)
+    like = [i for i, x in enumerate(found) if (x["method"], share(x), _limit(x), _recipe(x)) == wanted]
+    return like[0] if like and run["method"] == "f4sg" else None
 
 
 def as_weights(file: pathlib.Path) -> str:
@@ -312,5 +349,5 @@ FORMS: dict[str, Callable[[pathlib.Path], str]] = {
     "weights": as_weights,
     "why": as_why,
     "noise": as_noise,
-    "headline": as_headline,
+    "probe": as_probe,
 }

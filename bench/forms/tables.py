@@ -312,10 +312,11 @@ def hub(reports: Reports) -> str:
 
 
 def beside(reports: Reports) -> str:
-    """Speed in four rows, beside what one would use instead."""
+    """Speed in five rows, beside what one would use instead, and where and when each was measured."""
     ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
     (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
     (alone,) = matching(ant["rows"], kind="environment", physics="mujoco", num_envs=256)
+    (training,) = matching(ant["rows"], kind="training", physics="mujoco", num_envs=64)
     (gpu,) = matching(engines["rows"], task="ant_2x4", seeds=1, num_envs=16384, solver=None)
     (hands,) = matching(engines["rows"], task="hand_over_2x6", num_envs=16384, solver=None)
     case = {row["what"]: row for row in matching(grid["rows"], kind="power flow", task="case141", num_envs=1024)}
@@ -324,12 +325,15 @@ def beside(reports: Reports) -> str:
     head = ("what", "machine", "here, per second", "instead", "per second")
     lines = (
         ("ant, control steps", cpu, alone, "plain Python loops over C MuJoCo", plain),
-        ("ant, control steps", h200, gpu, "the same loops on those 2 threads", plain),
+        ("ant, control steps", h200, gpu, "the same loops on those 2 CPU threads", plain),
+        ("ant, steps of training", cpu, training, "", None),
         ("hands, control steps", h200, hands, "", None),
         ("141 buses, power flows", cpu, ours, "power-grid-model", theirs),
     )
     body = [(a, b, f"{rate(c):,.0f}", d, f"{rate(e):,.0f}" if e else "") for a, b, c, d, e in lines]
-    return markdown(head, body)
+    measured = {"Ant on a CPU": ant, "H200": engines, "buses": grid}
+    notes = [f"* {what}: {' '.join(where(report).split())[:-1]}." for what, report in measured.items()]
+    return markdown(head, body) + "\n\n" + "\n".join(notes)
 
 
 def limits(reports: Reports) -> str:

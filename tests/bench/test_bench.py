@@ -319,8 +319,8 @@ def test_the_readme_is_short_and_its_figures_are_made():
     assert len(text.split()) <= 900
     prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)|^\|.*?$", "", text, flags=re.DOTALL | re.MULTILINE)
     figures = set(re.findall(r"(?<![\w.-])\d[\d.,]*\d|(?<![\w.-])\d", prose))
-    # Python's versions, the ant's limit, the study's seeds a cell, how exactly recordings replay, ODbL's version.
-    assert figures == {"3.11", "3.13", "10", "20", "5", "1.0"}
+    # Python's versions, how exactly recordings replay, ODbL's version; and of the block on fear its p, steps and seeds.
+    assert figures == {"3.11", "3.13", "5", "1.0", "0.03", "1,000", "24.6", "16.1", "20"}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -405,6 +405,34 @@ def test_runs_are_stored_as_if_all_had_ended_with_the_first(tmp_path: pathlib.Pa
     assert both[0]["table"] == both[1]["table"]
 
 
+def test_a_larger_sample_has_the_same_settings_steps_and_source(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Settings newer than a run count as what was done before; a run with another one is no part of the sample."""
+    (table,) = [run for run in stored()["table1_ant_2x4_h200"] if run["method"] == "mappo_l"]
+    more = table | {"seeds": [7], "table": {"reward": [1.0], "cost": [20.0]}}
+    older = more | {"config": re.sub(r"^(lambda_rule|episode_starts) = .*\n", "", more["config"], flags=re.M)}
+    others = [more | {"config": more["config"].replace("lambda_init = 2.0", "lambda_init = 4.0")}]
+    others += [more | {"source": "evaluation"}, more | {"steps": [x // 2 for x in more["steps"]]}]
+    others += [more | {"config": more["config"] + 'walls = "solid"\n'}]
+    for name, found in {"table": [table], "more": [more, older], "others": others}.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(found))
+    monkeypatch.setattr(runs, "HEADLINES", ("table",))
+    assert runs.as_larger(tmp_path / "others.json").splitlines()[2:] == []
+    (line,) = runs.as_larger(tmp_path / "more+others.json").splitlines()[2:]
+    mean = (sum(table["table"]["reward"]) + 2.0) / 7
+    assert line.startswith(f"| `ant_2x4` | `mappo_l` | 7 | {mean:,.4g} |") and line.endswith("| 20 | 10 | 5 of 7 |")
+
+
+def test_curves_are_stored_with_as_many_points_as_asked_and_tables_come_from_all_rows(tmp_path: pathlib.Path):
+    run = fake_run(tmp_path / "run")
+    assert main(["store", str(run), "-o", str(tmp_path / "all.json")]) == 0
+    assert main(["store", str(run), "-o", str(tmp_path / "two.json"), "--points", "2"]) == 0
+    (every,), (two,) = (runs.load(tmp_path / f"{name}.json") for name in ("all", "two"))
+    assert len(two["steps"]) == 2 < len(every["steps"]) and two["steps"][-1] == every["steps"][-1]
+    assert two["table"] == every["table"]
+
+
 def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     for clip in (0.1, 0.2):
         fake_run(tmp_path / "runs" / f"clip={clip}", clip=clip)
@@ -413,6 +441,28 @@ def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
     assert lines[0] == "| task | method | cost | cost while training | reward |"
     assert [line.split(" | ")[1] for line in lines[2:]] == ["happo clip=0.1", "happo clip=0.2"]
     assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
+
+
+def test_points_have_true_costs_if_some_were_not_noticed(tmp_path: pathlib.Path):
+    (run,) = [x for x in stored()["fear_loss_toy"] if x["label"].endswith("cost_seen=0.1 fear_loss=ce lambda_lr=6")]
+    noticed, file = run | {"table": run["table"] | {"true cost": run["table"]["cost"]}}, tmp_path / "x.json"
+    for found, columns in (
+        ([noticed], "cost | cost while training"),
+        ([noticed, run], "cost | true cost | cost while"),
+    ):
+        file.write_text(json.dumps(found))
+        assert columns in runs.as_points(file).splitlines()[0]
+
+
+def test_pairs_say_what_survives_a_correction(tmp_path: pathlib.Path):
+    """Five seeds against five have p = .008 at best, which Holm multiplies by the number of pairs."""
+    (one,) = [run for run in stored()["table1_ant_2x4_h200"] if run["method"] == "happo"]
+    file = tmp_path / "x.json"
+    apart = [one | {"table": one["table"] | {"cost": [k + 10.0 * i for k in range(5)]}} for i in range(3)]
+    for i, method in enumerate(("happo", "mappo", "macpo")):
+        apart[i] |= {"method": method}
+    file.write_text(json.dumps(apart))
+    assert runs.as_pairs(file).splitlines()[-1].endswith("over the 3 pairs: 1.000 (reward) and .024 (cost).*")
 
 
 def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
