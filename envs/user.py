@@ -163,6 +163,8 @@ def _check_values(env: Env, name: str) -> None:
     import jax.numpy as jnp
     import numpy as np
 
+    from .vector import out_of_range
+
     def play(key: jax.Array) -> dict[str, jax.Array]:
         def step(state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             after = env.step(state, action)
@@ -183,7 +185,7 @@ def _check_values(env: Env, name: str) -> None:
             when = f"after step {step}" if step else "after reset"
             raise TaskError(f"{name}: {field} is not finite {when}")
     low, high = found["cost"].min(), found["cost"].max()
-    if low < 0 or high > 1:
+    if out_of_range(np.stack([low, high])).any():
         raise TaskError(f"{name}: costs must be within [0, 1], but the first steps give {low if low < 0 else high:g}")
 
 

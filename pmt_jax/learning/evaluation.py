@@ -20,6 +20,7 @@ from .types import ActingState, Hyper, Metrics, Tag
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
 FRESH_KEY = EVALUATION_KEY + 1  # of starts by which no policy was chosen
+COUNTS = ("non_finite", "cost_out_of_range")  # of steps of an episode that broke the contract of tasks
 STEP = "step/"  # before the names of what `play` records of every step
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
@@ -88,7 +89,8 @@ def play(
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
-      what the costs were before `feel`), episode_cost/k of each of several costs, and the task's info (means over the
+      what the costs were before `feel`), non_finite and cost_out_of_range (steps of the episode that were not finite,
+      or had a cost outside [0, 1]), episode_cost/k of each of several costs, and the task's info (means over the
       episode), each [episodes]; all undiscounted. With `record` also `step/NAME` [horizon, episodes, ...]: obs (before
       the action), action, reward, cost as felt, true_cost, terminated, truncated, info/NAME; 0 after an episode's end.
     """
@@ -112,10 +114,13 @@ def play(
             "violation_rate": cost.max(-1) > 0,
             "true_episode_cost": true_cost.mean(-1),
             "true_violation_rate": true_cost.max(-1) > 0,
+            "non_finite": outcome.non_finite,
+            "cost_out_of_range": outcome.cost_out_of_range,
             **{f"episode_cost/{k}": each[..., k].mean(-1) for k in several},
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
-        sums = {name: sums[name] + alive * now[name] for name in sums}
+        # No product: what is not finite, in `info`, times 0 is not 0.
+        sums = {name: sums[name] + jnp.where(alive, now[name], 0) for name in sums}
         kept = _recorded(seen, action, each, outcome, alive) if record else {}
         return (state, alive & ~(outcome.terminated | outcome.truncated), sums), kept
 
@@ -123,12 +128,12 @@ def play(
     start = vector.reset(jax.random.fold_in(key, vector.horizon))
     names = [f"episode_cost/{k}" for k in several]
     names += ["episode_reward", "episode_cost", "episode_length", "violation_rate"]
-    names += ["true_episode_cost", "true_violation_rate"]
+    names += ["true_episode_cost", "true_violation_rate", *COUNTS]
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
     carry = (start, jnp.ones(episodes, bool), sums)
     (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
-    per_step = [name for name in sums if not name.removeprefix("true_").startswith("episode_")]
+    per_step = [name for name in sums if not name.removeprefix("true_").startswith("episode_") and name not in COUNTS]
     return {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
 
 

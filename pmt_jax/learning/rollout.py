@@ -105,6 +105,7 @@ def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) ->
         truncated=outcome.truncated,
         info=outcome.info,
         non_finite=outcome.non_finite,
+        cost_out_of_range=outcome.cost_out_of_range,
         episode_reward=sums.reward_sum,
         episode_cost=sums.cost_sum,
         true_episode_cost=sums.true_cost_sum,
@@ -188,9 +189,18 @@ def summary(batch: Batch) -> dict[str, jax.Array]:
         "true_violation_rate": (true_cost.max(-1) > 0).mean(),
         "true_step_cost": true_cost.mean(),
         "non_finite": batch.non_finite.sum(),
+        "cost_out_of_range": batch.cost_out_of_range.sum(),
+        "worst_cost": _worst_cost(batch),
         **_each_cost(batch),
         **{f"info/{name}": x.mean() for name, x in batch.info.items()},
     }
+
+
+def _worst_cost(batch: Batch) -> jax.Array:
+    """The true cost that is farthest outside [0, 1], []; nan if all are within."""
+    low, high = batch.true_cost.min(), batch.true_cost.max()
+    worst = jnp.where(-low > high - 1, low, high)
+    return jnp.where(batch.cost_out_of_range.any(), worst, jnp.nan)
 
 
 def _each_cost(batch: Batch) -> dict[str, jax.Array]:

@@ -7,6 +7,7 @@ actions).
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -19,6 +20,7 @@ from ..errors import UsageError
 from ..files import Note
 from ..formats import limits
 from ..tasks import columns as task_columns
+from ..training.health import faults
 from . import statistics
 from .run_log import Group, RunLog, groups
 
@@ -91,6 +93,7 @@ class Row:
       excess: [seeds] cost beyond the limit, see `RunLog.excess`; of `scores` if None.
       limits: of each cost; the one if empty.
       true_limit: on true costs; nan if unknown.
+      faults: which steps broke the contract of tasks, in a sentence; empty if none did.
     """
 
     task: str
@@ -103,6 +106,7 @@ class Row:
     excess: np.ndarray | None = None
     limits: tuple[float, ...] = ()
     true_limit: float = math.nan
+    faults: str = ""
 
     def score(self, column: str) -> np.ndarray:
         """[seeds] of a column, nan if the row does not have it."""
@@ -170,6 +174,10 @@ def _row(group: Group) -> Row:
         excess=np.concatenate([run.excess for run in group.runs]),
         limits=first.limits,
         true_limit=group.true_limit,
+        faults=faults(
+            sum((run.faults for run in group.runs), collections.Counter()),
+            sum(len(run.seeds) * int(run.steps[-1]) for run in group.runs),
+        ),
     )
 
 

@@ -5,6 +5,7 @@ Tables, plots and reports all read through here.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import json
 import math
@@ -17,6 +18,7 @@ import numpy as np
 from ..config.settings import Config, load_config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
+from ..training.health import count_faults
 from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
@@ -115,6 +117,11 @@ class RunLog:
     def _final(self, name: str) -> np.ndarray:
         found = self.final(name)
         return np.full(len(self.seeds), np.nan) if found is None else found
+
+    @property
+    def faults(self) -> collections.Counter[str]:
+        """How many steps of all seeds broke the contract of tasks (`health.count_faults`)."""
+        return count_faults(self.metrics, self.settings.get("eval_episodes", 0))
 
     def until(self, step: int) -> RunLog:
         """The same run as if it had ended after this step.

@@ -25,6 +25,7 @@ from ..learning import sharding
 from . import processes
 
 KEEP = 2
+_ROW = "['row']"  # before the names of what is known of a row that has not ended
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
@@ -143,7 +144,9 @@ class Checkpoints:
         return processes.by_first(lambda: sorted(self._manager.all_steps(), reverse=True))
 
     def load(self, like: Any, warn: Callable[[str], object]) -> tuple[int, Any]:
-        """The newest checkpoint that is whole: its step, and its tree in the structure of `like`.
+        """The newest checkpoint that is whole: its step, and its tree in the structure of `like`, a dictionary.
+
+        The tree's `row`, arrays by their names, has no structure: it is what was saved, {} if nothing was.
 
         Args:
           warn: called with a sentence for every newer one that cannot be read.
@@ -152,7 +155,8 @@ class Checkpoints:
           UsageError: there is none, or it belongs to another kind of run.
         """
         step, packed = processes.by_first(lambda: self._newest(warn))
-        return step, unpack(packed, like)
+        row = {path: packed.pop(path) for path in list(packed) if path.startswith(_ROW)}
+        return step, unpack(packed, like) | {"row": {path[len(_ROW) + 2 : -2]: x for path, x in row.items()}}
 
     def _newest(self, warn: Callable[[str], object]) -> tuple[int, dict[str, np.ndarray]]:
         steps = sorted(self._manager.all_steps(), reverse=True)

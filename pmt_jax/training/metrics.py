@@ -13,7 +13,7 @@ from ..learning.evaluation import interval
 from ..learning.setup import Setup
 
 Row = dict[str, Any]
-Reduction = Literal["mean", "sum", "loss"]
+Reduction = Literal["mean", "sum", "loss", "worst"]
 
 
 class Metric(NamedTuple):
@@ -23,7 +23,7 @@ class Metric(NamedTuple):
       unit: of its values.
       definition: what it measures, over the updates of one row.
       reduction: how the updates of a row become one value. `mean` leaves out what is not finite, `loss` does not: a
-        loss that was not finite even once must show.
+        loss that was not finite even once must show. `worst` is the one farthest from [0, 1].
     """
 
     unit: str
@@ -57,6 +57,8 @@ METRICS: dict[str, Metric] = {
     "true_violation_rate": Metric("", "violation_rate of what the costs were"),
     "true_step_cost": Metric("cost", "step_cost of what the costs were"),
     "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
+    "cost_out_of_range": Metric("steps", "steps with a cost outside [0, 1]; they stop the seed", "sum"),
+    "worst_cost": Metric("cost", "the cost farthest outside [0, 1]; null if all are within", "worst"),
     "lambda": Metric("", "the multiplier, mean over agents and costs; of MACPO how far its limit is lowered, per step"),
     "cost_excess": Metric("cost per step", "how far the estimated episode cost is beyond the limit less `cost_margin`"),
     "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),
@@ -161,6 +163,8 @@ def _reduce(name: str, values: np.ndarray) -> float | int:
     if reduction == "loss":
         return float(values.mean())
     seen = values[np.isfinite(values)]
+    if reduction == "worst" and seen.size:
+        return float(seen[np.abs(seen - 0.5).argmax()])
     return float(seen.mean()) if seen.size else math.nan
 
 

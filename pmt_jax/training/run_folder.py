@@ -152,10 +152,13 @@ def write_settings(out: pathlib.Path, setup: Setup) -> None:
     replace_text(out / "config.toml", to_toml(setup.config))
 
 
-def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
+def keep_rows_until(out: pathlib.Path, step: int, say: Say, open_steps: int = 0) -> list[Row]:
     """Drops the rows after the checkpoint that the run continues from, and a line that was cut off.
 
     If there is no checkpoint, all rows are kept under another name.
+
+    Args:
+      open_steps: the last steps of the checkpoint, of which there is no row yet.
 
     Returns:
       the rows up to `step`.
@@ -177,7 +180,7 @@ def keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
         _check_number(metrics, row, "seed")
         _check_number(metrics, row, "seconds")
     last = rows[-1]["step"] if rows else 0
-    if last < step:
+    if last < step - open_steps:
         say(f"{metrics} ends at step {last:,}, but the checkpoint is of step {step:,}: the rows between are lost")
     if metrics.exists():
         replace_text(metrics, "".join(json.dumps(row) + "\n" for row in rows))
