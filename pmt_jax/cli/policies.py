@@ -9,7 +9,7 @@ from typing import Any
 
 from ..config.settings import convert
 from ..errors import UsageError
-from ..output import say
+from ..output import result, say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, limits, whole
 from .process import at_once
 
@@ -80,22 +80,24 @@ def run_eval(arguments: argparse.Namespace) -> int:
         how += " of the best policy" if which == "best" else ""
     shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
     count = f"{episodes} episode{'s' * (episodes > 1)}"
-    say(f"{arguments.source}: {count} a seed, {how}; {shown}")
+    result(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
         _say_row(row)
     if arguments.save:
-        say(f"wrote every step to {arguments.save}")
+        result(f"wrote every step to {arguments.save}")
     return 0
 
 
 def _say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
     whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
-    say(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
+    result(f"{whose}(cost limit {limits(row['cost_limit'])} an episode)")
     metrics = {name: x for name, x in row.items() if isinstance(x, tuple) and name != "cost_limit"}
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
-        say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
+        result(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
+    if row["faults"]:
+        result(f"  note: {row['faults']}")
 
 
 def run_export(arguments: argparse.Namespace) -> int:
@@ -116,11 +118,11 @@ def run_hub(arguments: argparse.Namespace) -> int:
     del arguments
     from ..policies import hub
 
-    say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
+    result("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
         facts = hub.about(name)
         (reward, rewards), (cost, costs) = (facts["figures"][f"episode_{what}"] for what in ("reward", "cost"))
         limit = f"limit {facts['cost_limit']:g}"
-        say(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
+        result(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
     return 0

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+from .. import output
 from ..errors import UsageError
 
 
@@ -18,6 +19,7 @@ def answer(name: str, command: Callable[[], int]) -> int:
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # >&- closes
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what the terminal cannot show
+    output.begin()
     try:
         code = command()
         sys.stdout.flush()  # here, where a closed pipe is noticed, and not when Python ends
@@ -34,20 +36,11 @@ def answer(name: str, command: Callable[[], int]) -> int:
     except OSError as error:  # a path that is too long, a folder that may not be read, a full disk
         return _refuse(name, f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
     except RuntimeError as error:
-        if not _is_out_of_memory(error):
+        if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):  # JAX, which defines them, loads slowly
             raise
-        return _refuse(name, f"{str(error).splitlines()[0].removeprefix(_NO_MEMORY)}; {_LESS}")
+        from ..training import failures
 
-
-_NO_MEMORY = "RESOURCE_EXHAUSTED: "
-_LESS = (
-    "other programs may share the device: take fewer of them (--jobs), or a smaller num_envs, rollout_length or seeds"
-)
-
-
-def _is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether XLA found no memory for a program; JAX, which defines its errors, is not imported for other commands."""
-    return type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and str(error).startswith(_NO_MEMORY)
+        return _refuse(name, failures.explain(error))
 
 
 def _refuse(name: str, sentence: str) -> int:
