@@ -161,7 +161,7 @@ def training(case: Case) -> Build:
         box = [state]
 
         def call() -> None:
-            box[0], _ = jax.block_until_ready(programs.chunk(box[0]))
+            box[0], _ = jax.block_until_ready(programs.chunk(box[0], updates))
 
         return Program(call, case.seeds * steps, facts)
 

@@ -92,7 +92,7 @@ def checkpoint(case: Case) -> Row:
     box = [state, run_folder.initial_best(state)]
 
     def train() -> None:
-        box[0], _ = programs.chunk(box[0])
+        box[0], _ = programs.chunk(box[0], 1)
 
     def keep() -> None:
         box[1] = run_folder.Best(programs.take(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)

@@ -172,6 +172,7 @@ def _check_values(env: Env, name: str) -> None:
     import numpy as np
 
     from .base import shares_cost
+    from .vector import out_of_range
 
     def play(key: jax.Array) -> dict[str, jax.Array]:
         def step(state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
@@ -194,7 +195,7 @@ def _check_values(env: Env, name: str) -> None:
             when = f"after step {step}" if step else "after reset"
             raise TaskError(f"{name}: {field} is not finite {when}")
     low, high = found["cost"].min(), found["cost"].max()
-    if low < 0 or high > 1:
+    if out_of_range(np.stack([low, high])).any():
         raise TaskError(f"{name}: costs must be within [0, 1], but the first steps give {low if low < 0 else high:g}")
     if shares_cost(env) and np.ptp(found["cost"], axis=1).any():
         raise TaskError(f"{name}: it has shares_cost = True, but its agents' costs differ; leave shares_cost out")

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 
 from .base import Env, EnvSpec, State
 
+ROUNDING = 1e-6  # of a cost: a mean of costs in 32 bits may be 1 + 1e-7
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Outcome:
       truncated: [B] bool, cut by the time limit: bootstrap from the next state. Never both.
       next_obs, next_global_state: [B, N, O], [B, S] the true next observation and state.
       non_finite: [B] bool, the step was not finite and has been replaced (see `VectorEnv.step`).
+      cost_out_of_range: [B] bool, a cost of the step is outside [0, 1]; it is kept as it is.
     """
 
     reward: jax.Array
@@ -50,6 +53,7 @@ class Outcome:
     next_obs: jax.Array
     next_global_state: jax.Array
     non_finite: jax.Array
+    cost_out_of_range: jax.Array
 
 
 class VectorEnv:
@@ -94,10 +98,13 @@ class VectorEnv:
 
         A step that leaves anything non-finite (or started from it) is quarantined: the episode terminates, its last
         step counts reward 0 and cost 1, the last finite observation replaces the next, and `non_finite` is set.
+        `info` is only logged: what is not finite there stays as it is and changes nothing else.
         """
         before = state.env
         after = jax.vmap(self.env.step)(before, action)
-        bad = ~_finite(after)
+        # The state without `info` decides alone. The whole state's check changes no truth, but without it XLA fuses the
+        # programs of some tasks otherwise, and their last bits would differ from those of earlier runs.
+        bad = ~(_finite(after) | _finite(dataclasses.replace(after, info={})))
         terminated = after.terminated | bad
         elapsed = state.elapsed + 1
         truncated = (elapsed >= self.horizon) & ~terminated
@@ -112,6 +119,7 @@ class VectorEnv:
             next_obs=_where(bad, before.obs, after.obs),
             next_global_state=_where(bad, before.global_state, after.global_state),
             non_finite=bad,
+            cost_out_of_range=out_of_range(after.cost).any((-2, -1)) & ~bad,
         )
         done = terminated | truncated
         episode = state.episode + done
@@ -162,6 +170,11 @@ def felt_cost(
     costly = (cost > 0).any((-2, -1))
     felt = _where(costly & (draw >= cost_seen), jnp.zeros_like(cost), cost)
     return _where(~costly & (draw < cost_false), jnp.ones_like(cost), felt)
+
+
+def out_of_range(cost: jax.Array) -> jax.Array:
+    """Of costs [...] whether each is outside [0, 1] by more than rounding; [...] bool."""
+    return (cost < -ROUNDING) | (cost > 1 + ROUNDING)
 
 
 def _finite(state: State) -> jax.Array:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
 
+from .errors import UsageError
+
 Say = Callable[[str], None]
+CLOSED = (errno.EPIPE, errno.EIO)  # the reader has ended, or the terminal is gone: nobody waits for the rest
+_dropped: list[OSError] = []  # why output is no longer written
 
 
 def say(line: str) -> None:
@@ -17,6 +22,32 @@ def say(line: str) -> None:
     """
     with dropped_if_closed():
         print(f"{line}\n", end="", flush=True)
+
+
+def result(text: str) -> None:
+    """Prints what a command was asked for, lines without the last newline; drops it if nobody reads any more.
+
+    Raises:
+      UsageError: as `check_written`.
+    """
+    say(text)
+    check_written()
+
+
+def check_written() -> None:
+    """Whether all that this command has printed was written, or nobody reads it any more.
+
+    Raises:
+      UsageError: it was not: a full disk, a quota.
+    """
+    lost = next((error for error in _dropped if error.errno not in CLOSED), None)
+    if lost is not None:
+        raise UsageError(f"cannot write to standard output: {lost.strerror or lost}; the result is not complete")
+
+
+def begin() -> None:
+    """Forgets what an earlier command of this process could not write."""
+    _dropped.clear()
 
 
 def silent(line: str) -> None:
@@ -29,6 +60,7 @@ def dropped_if_closed() -> Iterator[None]:
     """Output that fails inside is dropped, and so is all that follows; the program continues."""
     try:
         yield
-    except OSError:  # EPIPE of a pipe, EIO of a terminal, ENOSPC of a file
+    except OSError as error:  # EPIPE of a pipe, EIO of a terminal, ENOSPC of a file
+        _dropped.append(error)
         with contextlib.suppress(OSError):  # a captured standard output has no descriptor
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

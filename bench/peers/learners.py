@@ -75,7 +75,7 @@ def ours(arguments: Arguments, report: Report) -> None:
     report.about(physics=setup.vector.env.engine)
     state, programs = compile_run(setup, lambda _: None)
     for update in itertools.count(1):
-        state, metrics = programs.chunk(state)
+        state, metrics = programs.chunk(state, 1)
         report(update * setup.config.batch_size, *(metrics[f"episode_{what}"].mean() for what in ("reward", "cost")))
 
 

@@ -12,6 +12,7 @@ import pmt_jax
 
 from ..config.methods import METHODS
 from ..errors import UsageError
+from ..output import result
 from ..tasks import did_you_mean
 from ..tasks import names as task_names
 from . import doctor, pictures, policies, studies, tasks, train
@@ -62,7 +63,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
                 action.choices = list(words[action.dest])
             elif action.dest == "source" or action.type is pathlib.Path:
                 action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]
-    print(shtab.complete(parser, arguments.shell))
+    result(shtab.complete(parser, arguments.shell))
     return 0
 
 

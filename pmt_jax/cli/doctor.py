@@ -13,7 +13,7 @@ import pmt_jax
 
 from .. import numerics, tasks
 from ..errors import UsageError
-from ..output import say
+from ..output import result
 from ..probe import run_python
 from ..render import gl
 from .parser import command
@@ -63,7 +63,7 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Prints all findings."""
     del arguments
-    return report(say)
+    return report(result)
 
 
 def report(say: Callable[[str], None]) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from ..errors import UsageError
+from ..output import result
 from ..tasks import did_you_mean
 
 RUN = "a run folder, or a pretrained policy: hub:ant_2x4/r4sg (pmt hub lists them)"
@@ -28,6 +29,11 @@ class Parser(argparse.ArgumentParser):
         """Raises argparse's message, or the sentence of one of the types below."""
         fault = re.fullmatch(r"argument (?:\S+/)?(\S+): (must .*)", message, re.DOTALL)
         raise UsageError(f"{fault[1]} {fault[2]}" if fault else f"{message} (see {self.prog} --help)")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Help, which argparse would drop where it cannot be written."""
+        del file
+        result(message.removesuffix("\n"))
 
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
         """As `parse_args`, but an unknown flag gets the nearest known one."""

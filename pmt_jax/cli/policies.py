@@ -11,7 +11,7 @@ from .. import numerics
 from ..config.load import convert
 from ..errors import UsageError
 from ..files import to_stderr
-from ..output import say
+from ..output import result, say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, whole
 from .process import at_once
 
@@ -84,11 +84,11 @@ def run_eval(arguments: argparse.Namespace) -> int:
         how += " of the best policy" if which == "best" else ""
     shown = "mean +- half-width of the 95 % interval" if episodes > 1 else "one episode has no interval"
     count = f"{episodes} episode{'s' * (episodes > 1)}"
-    say(f"{arguments.source}: {count} a seed, {how}; {shown}")
+    result(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
         _say_row(row)
     if arguments.save:
-        say(f"wrote every step to {arguments.save}")
+        result(f"wrote every step to {arguments.save}")
     return 0
 
 
@@ -97,11 +97,13 @@ def _say_row(row: dict[str, Any]) -> None:
     from ..limits import Limits
 
     whose = f"seed {row['seed']} after {row['step']:,} steps " if "seed" in row else ""
-    say(f"{whose}(cost limit {Limits.of_row(row)} an episode)")
+    result(f"{whose}(cost limit {Limits.of_row(row)} an episode)")
     metrics = {name: x for name, x in row.items() if isinstance(x, tuple)}
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
-        say(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
+        result(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
+    if row["faults"]:
+        result(f"  note: {row['faults']}")
 
 
 def run_export(arguments: argparse.Namespace) -> int:
@@ -124,7 +126,7 @@ def run_hub(arguments: argparse.Namespace) -> int:
     from ..limits import WORST
     from ..policies import hub
 
-    say("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
+    result("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
         try:
@@ -135,5 +137,5 @@ def run_hub(arguments: argparse.Namespace) -> int:
         figures, limit = facts["figures"], f"limit {facts['cost_limit']:g}"
         reward, rewards = figures["episode_reward"]
         cost, costs = figures.get(f"episode_cost{WORST}", figures["episode_cost"])
-        say(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
+        result(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")
     return 0

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from .. import numerics
+from .. import numerics, output
 from ..errors import UsageError
 
 _PACKAGE = pathlib.Path(__file__).parents[1]
@@ -24,6 +24,7 @@ def answer(name: str, command: Callable[[], int]) -> int:
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # >&- closes
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what the terminal cannot show
+    output.begin()
     try:
         with _plain_warnings(name):
             code = command()
@@ -49,20 +50,11 @@ def answer(name: str, command: Callable[[], int]) -> int:
             raise
         return _refuse(name, f"JAX cannot start: {str(error).splitlines()[0]}; correct or unset that variable")
     except RuntimeError as error:
-        if not _is_out_of_memory(error):
+        if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):  # JAX, which defines them, loads slowly
             raise
-        return _refuse(name, f"{str(error).splitlines()[0].removeprefix(_NO_MEMORY)}; {_LESS}")
+        from ..training import failures
 
-
-_NO_MEMORY = "RESOURCE_EXHAUSTED: "
-_LESS = (
-    "other programs may share the device: take fewer of them (--jobs), or a smaller num_envs, rollout_length or seeds"
-)
-
-
-def _is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether XLA found no memory for a program; JAX, which defines its errors, is not imported for other commands."""
-    return type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and str(error).startswith(_NO_MEMORY)
+        return _refuse(name, failures.explain(error))
 
 
 @contextlib.contextmanager

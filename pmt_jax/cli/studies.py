@@ -7,7 +7,7 @@ import pathlib
 from typing import Any
 
 from ..errors import UsageError
-from ..output import say
+from ..output import check_written, result, say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
 from .parser import SOURCE, add_format, add_jobs, add_trust, command, whole
@@ -130,7 +130,9 @@ def run_sweep(arguments: argparse.Namespace) -> int:
         check_source(source, [config.task for config in points.values()])
         for run in {run for config in points.values() for run in (config.init, config.init_fear) if run}:
             check_trusted(pathlib.Path(run))  # here, because worker processes do not ask again
-        return sweep.sweep(parts, points, arguments.out, _launch(arguments))
+        code = sweep.sweep(parts, points, arguments.out, _launch(arguments))
+    check_written()
+    return code
 
 
 def _launch(arguments: argparse.Namespace) -> Any:
@@ -150,7 +152,7 @@ def run_table(arguments: argparse.Namespace) -> int:
     found = rows(read_all(arguments.sources))
     text = table.render(found, arguments.format, arguments.baseline, arguments.test)
     if arguments.output is None:
-        print(text, end="")
+        result(text.removesuffix("\n"))
         return 0
     with writing(arguments.output) as partial:
         partial.write_text(text)
@@ -162,7 +164,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     """Prints how two runs differ."""
     from ..studies import pair
 
-    print(pair.compare(arguments.first, arguments.second, arguments.out), end="")
+    result(pair.compare(arguments.first, arguments.second, arguments.out).removesuffix("\n"))
     if arguments.out:
         say(f"wrote {arguments.out}")
     return 0
@@ -175,4 +177,6 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
     from ..studies import reproduce
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
-    return reproduce.reproduce(arguments.table, arguments.budget, out, arguments.format, _launch(arguments))
+    code = reproduce.reproduce(arguments.table, arguments.budget, out, arguments.format, _launch(arguments))
+    check_written()
+    return code

@@ -8,7 +8,7 @@ from typing import Any
 from .. import numerics, tasks
 from ..config import load
 from ..config.load import load_config
-from ..output import say
+from ..output import result
 from ..trust import check_source
 from .parser import command
 from .process import at_once
@@ -27,8 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
         return _describe(arguments.task)
     width = max(map(len, tasks.names()))
     for name in tasks.names():
-        say(f"{name:{width}}  {load.about(name)}")
-    say("\npmt envs TASK describes one in full, pmt train TASK --help shows its settings.")
+        result(f"{name:{width}}  {load.about(name)}")
+    result("\npmt envs TASK describes one in full, pmt train TASK --help shows its settings.")
     return 0
 
 
@@ -48,14 +48,14 @@ def _describe(name: str) -> int:
         "engines": _engines(env.engine),
         "settings": ", ".join(known for known in (name, f"paper/{name}") if known in load.names()) or "the defaults",
     }
-    say(f"{name}: {load.about(name) or 'a task of your own'}")
+    result(f"{name}: {load.about(name) or 'a task of your own'}")
     for what, text in facts.items():
-        say(f"  {what:12} {text}")
+        result(f"  {what:12} {text}")
     options = tasks.options(name) | (dict(load_config(name).env) if name in load.names() else {})
     defaults = ", by default " + ", ".join(f"{k}={v}" for k, v in options.items()) if options else ": it has none"
-    say(f"  options      --env NAME=VALUE{defaults}")
+    result(f"  options      --env NAME=VALUE{defaults}")
     for line in tasks.explain_options(name).splitlines():
-        say(f"    {line}")
+        result(f"    {line}")
     return 0
 
 

@@ -210,7 +210,7 @@ class Config(Hyper):
     method: str = common("mappo_l", "which method learns: a row of the table in pmt_jax/config/methods.py")
     steps: int = common(
         1_000_000,
-        "environment steps per seed, over all its environments; rounded up to whole chunks of log_interval updates",
+        "environment steps per seed, over all its environments; rounded up to whole updates",
         AT_LEAST_ONE,
     )
     seeds: int = common(1, "number of seeds that train side by side in one program", COUNT)
@@ -279,7 +279,7 @@ class Config(Hyper):
         "auto", "simulation engine; auto takes the fastest for the device"
     )
     env: tuple[tuple[str, Any], ...] = simulation((), "the task's own options (pmt envs TASK lists them)")
-    log_interval: int = output(1, "updates per row of metrics.jsonl", COUNT)
+    log_interval: int = output(1, "updates per row of metrics.jsonl; the last row may have fewer", COUNT)
     eval_interval: int = output(
         0,
         "updates between evaluations under mean actions, rounded up to whole rows; 0 for none",
@@ -303,14 +303,9 @@ class Config(Hyper):
         return self.num_envs * self.rollout_length
 
     @property
-    def num_chunks(self) -> int:
-        """Chunks of `log_interval` updates that cover `steps`."""
-        return -(-self.steps // (self.batch_size * self.log_interval))
-
-    @property
     def num_updates(self) -> int:
-        """Updates that cover `steps`, in whole chunks."""
-        return self.num_chunks * self.log_interval
+        """Updates that cover `steps`."""
+        return -(-self.steps // self.batch_size)
 
     def replace(self, **changes: Any) -> Config:
         """A copy with some fields changed, checked like a new one."""

@@ -20,6 +20,7 @@ from .types import ActingState, Hyper, Metrics, Tag
 
 EVALUATION_KEY = 20_260_000  # far from the seeds people use for training
 FRESH_KEY = EVALUATION_KEY + 1  # of starts by which no policy was chosen
+COUNTS = ("non_finite", "cost_out_of_range")  # of steps of an episode that broke the contract of tasks
 STEP = "step/"  # before the names of what `play` records of every step
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
@@ -85,7 +86,8 @@ def play(
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
-      what the costs were before `feel`), each agent's and cost's episode_cost/... and true_episode_cost/... (see
+      what the costs were before `feel`), non_finite and cost_out_of_range (steps of the episode that were not finite,
+      or had a cost outside [0, 1]), each agent's and cost's episode_cost/... and true_episode_cost/... (see
       `limits.columns`), and the task's info (means over the episode), each [episodes]; all undiscounted. With `record`
       also `step/NAME` [horizon, episodes, ...]: obs (before the action), action, reward, cost as felt, true_cost,
       terminated, truncated, info/NAME; 0 after an episode's end.
@@ -115,15 +117,18 @@ def _play(
             "violation_rate": (each > 0).any((-2, -1)),
             "true_episode_cost": outcome.cost,
             "true_violation_rate": (outcome.cost > 0).any((-2, -1)),
+            "non_finite": outcome.non_finite,
+            "cost_out_of_range": outcome.cost_out_of_range,
             **{f"info/{name}": x for name, x in outcome.info.items()},
         }
+        # No product: what is not finite, in `info`, times 0 is not 0.
         sums = {name: sums[name] + _masked(now[name], alive) for name in sums}
         kept = _recorded(seen, action, each, outcome, alive) if record else {}
         return (state, alive & ~(outcome.terminated | outcome.truncated), sums), kept
 
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
     start = vector.reset(jax.random.fold_in(key, vector.horizon))
-    names = ["episode_reward", "episode_length", "violation_rate", "true_violation_rate"]
+    names = ["episode_reward", "episode_length", "violation_rate", "true_violation_rate", *COUNTS]
     names += [f"info/{name}" for name in start.env.info]
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
     costs = ("episode_cost", "true_episode_cost")
@@ -131,7 +136,7 @@ def _play(
     carry = (start, jnp.ones(episodes, bool), sums)
     (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
     felt, true = (sums.pop(name) for name in costs)
-    per_step = [name for name in sums if not name.startswith("episode_")]
+    per_step = [name for name in sums if not name.startswith("episode_") and name not in COUNTS]
     found = {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
     shared = tasks.shares_cost(env)
     for name, cost in zip(costs, (felt, true), strict=True):

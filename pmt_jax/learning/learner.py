@@ -60,6 +60,25 @@ def train_chunk(setup: Setup, hyper: Hyper, state: LearnerState, updates: int) -
     return jax.lax.scan(lambda s, _: train_step(setup, hyper, s), state, length=updates)
 
 
+def train_some(
+    setup: Setup, hyper: Hyper, state: LearnerState, updates: jax.Array, most: int
+) -> tuple[LearnerState, Metrics]:
+    """As `train_chunk`, but one program trains any number of `updates`, [] int32 up to `most`.
+
+    Returns:
+      the state, and metrics with a leading [most]; those from `updates` on are 0.
+    """
+    _, like = jax.eval_shape(partial(train_step, setup, hyper), state)
+    nothing = jax.tree.map(lambda x: jnp.zeros((most, *x.shape), x.dtype), like)
+
+    def step(i: jax.Array, carry: tuple[LearnerState, Metrics]) -> tuple[LearnerState, Metrics]:
+        state, seen = carry
+        state, metrics = train_step(setup, hyper, state)
+        return state, jax.tree.map(lambda x, new: x.at[i].set(new), seen, metrics)
+
+    return jax.lax.fori_loop(0, updates, step, (state, nothing))
+
+
 def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
     """The state before the first update of the run that `key` names."""
     spec = setup.vector.spec

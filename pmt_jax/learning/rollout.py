@@ -107,6 +107,7 @@ def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) ->
         truncated=outcome.truncated,
         info=outcome.info,
         non_finite=outcome.non_finite,
+        cost_out_of_range=outcome.cost_out_of_range,
         episode_reward=sums.reward_sum,
         episode_cost=sums.cost_sum,
         true_episode_cost=sums.true_cost_sum,
@@ -176,6 +177,8 @@ def summary(batch: Batch, shares_cost: bool = False) -> dict[str, jax.Array]:
         "true_violation_rate": (true_cost.max(-1) > 0).mean(),
         "true_step_cost": true_cost.mean(),
         "non_finite": batch.non_finite.sum(),
+        "cost_out_of_range": batch.cost_out_of_range.sum(),
+        "worst_cost": _worst_cost(batch),
         **spread,
         **_each_cost("episode_cost", finished_mean(batch, batch.episode_cost), shares_cost),
         **_each_cost("true_episode_cost", finished_mean(batch, batch.true_episode_cost), shares_cost),
@@ -185,6 +188,13 @@ def summary(batch: Batch, shares_cost: bool = False) -> dict[str, jax.Array]:
 
 def _each_cost(name: str, mean: jax.Array, shares_cost: bool) -> dict[str, jax.Array]:
     return limits.worst(name, mean, shares_cost) | limits.columns(name, mean, shares_cost)
+
+
+def _worst_cost(batch: Batch) -> jax.Array:
+    """The true cost that is farthest outside [0, 1], []; nan if all are within."""
+    low, high = batch.true_cost.min(), batch.true_cost.max()
+    worst = jnp.where(-low > high - 1, low, high)
+    return jnp.where(batch.cost_out_of_range.any(), worst, jnp.nan)
 
 
 def flatten_steps(x: jax.Array) -> jax.Array:

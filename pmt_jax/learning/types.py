@@ -78,7 +78,7 @@ class Batch:
       reward: [T, B]; cost: [T, B, N, K] as felt (see `envs.vector.felt_cost`); true_cost: the same as it was.
       terminated, truncated: [T, B] bool, never both.
       info: {name: [T, B]}.
-      non_finite: [T, B] bool, quarantined steps.
+      non_finite: [T, B] bool, quarantined steps; cost_out_of_range: [T, B] bool, steps with a cost outside [0, 1].
       episode_reward: [T, B], episode_cost and true_episode_cost: [T, B, N, K], episode_length: [T, B]: sums up to
         and with this step; complete if the episode is done.
       whole: [T, B] bool, the time limit counts from the episode's own beginning; False in first ones with spread starts
@@ -99,6 +99,7 @@ class Batch:
     truncated: jax.Array
     info: dict[str, jax.Array]
     non_finite: jax.Array
+    cost_out_of_range: jax.Array
     episode_reward: jax.Array
     episode_cost: jax.Array
     true_episode_cost: jax.Array

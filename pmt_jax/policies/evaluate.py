@@ -17,8 +17,9 @@ from ..learning.evaluation import STEP, play
 from ..learning.setup import Setup
 from ..learning.types import ActingState
 from ..limits import Limits
+from ..training import failures
 from ..training.compile import evaluate_seeds
-from ..training.health import NO_ROOM
+from ..training.health import FAULTS, NO_ROOM, faults
 from ..training.metrics import seed_intervals
 from ..training.run_folder import MATMUL_PRECISION
 from . import hub
@@ -35,6 +36,8 @@ def evaluate_run(
     save: pathlib.Path | None = None,
 ) -> list[dict[str, Any]]:
     """One row per seed of a run: each metric's mean over episodes and the half-width of its 95 % interval.
+
+    `faults` says which steps broke the contract of tasks; it is empty if none did.
 
     A state that was chosen, a pretrained policy or `best`, is evaluated from other starts than it was chosen by.
 
@@ -69,13 +72,15 @@ def evaluate_states(
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     program = evaluate_seeds(setup, episodes, deterministic, fresh, record=save is not None)
-    results = jax.device_get(jax.jit(program)(state))
+    with failures.named():
+        results = jax.device_get(jax.jit(program)(state))
     if setup.overflow and np.any(results[setup.overflow] > 0):
         raise UsageError(f"{NO_ROOM}; evaluate with another --physics")
     if save:
         results = _save_steps(save, results, setup.config.seed)
+    wrong = _take_faults(results)
     return [
-        {"seed": setup.config.seed + i, **setup.limits.columns, "step": step, **figures}
+        {"seed": setup.config.seed + i, **setup.limits.columns, "step": step, "faults": wrong[i], **figures}
         for i, (figures, step) in enumerate(zip(seed_intervals(results), _steps(setup, state), strict=True))
     ]
 
@@ -96,10 +101,25 @@ def evaluate_baseline(
     env = tasks.make(task, **options)
     act = jax.vmap(tasks.baseline(env, policy))
     record = save is not None
-    results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes, record=record))())
+    with failures.named():
+        results = jax.device_get(jax.jit(lambda: play(env, lambda state, _: act(state), episodes, record=record))())
     one_seed = {name: x[None] for name, x in results.items()}
-    (figures,) = seed_intervals(_save_steps(save, one_seed, 0) if save else one_seed)
-    return {**Limits.of_task(env.spec).columns, **figures}
+    if save:
+        one_seed = _save_steps(save, one_seed, 0)
+    (wrong,) = _take_faults(one_seed)
+    (figures,) = seed_intervals(one_seed)
+    return {**Limits.of_task(env.spec).columns, "faults": wrong, **figures}
+
+
+def _take_faults(results: dict[str, np.ndarray]) -> list[str]:
+    """Removes the counts of steps that broke the contract of tasks; says for every seed what was wrong, "" if nothing.
+
+    Args:
+      results: metrics [seeds, episodes].
+    """
+    counts = {name: results.pop(name).sum(1).astype(int).tolist() for name in FAULTS}
+    steps = results["episode_length"].sum(1).astype(int).tolist()
+    return [faults({name: x[i] for name, x in counts.items()}, total) for i, total in enumerate(steps)]
 
 
 def _check_ending(save: pathlib.Path | None) -> None:

@@ -15,6 +15,7 @@ from ..policies import evaluate
 from ..studies import plot, table
 from ..studies.rows import rows
 from ..studies.run_log import Group, RunLog, read_all
+from ..training.health import faults
 from . import episode, page
 
 
@@ -120,10 +121,11 @@ def _run_section(log: RunLog, episodes: int) -> list[str]:
 def _summary(log: RunLog) -> str:
     seeds = ", ".join(map(str, log.seeds))
     seconds = log.metrics.get("seconds", [[math.nan]])[0][-1]
+    wrong = faults(log.faults, int(log.steps[-1]) * len(log.seeds))
     took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
     return (
         f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "
-        f"limit on an episode's cost {log.limits}."
+        f"limit on an episode's cost {log.limits}.{f' {wrong}.' if wrong else ''}"
     )
 
 
@@ -151,9 +153,11 @@ def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
         heads = (name.removeprefix("info/").removeprefix("episode_").replace("_", " ") for name in names)
         return page.table(["policy", *heads], cells)
 
+    wrong = [f"<p>Seed {row['seed']}, {kind} actions: {row['faults']}.</p>" for kind, row in results if row["faults"]]
     return [
         f"<h3>Evaluation</h3><p>{episodes} whole episode{'s' * (episodes > 1)} a seed from fixed starts, actions "
         "sampled or the mean; mean and half-width of its 95 % interval.</p>",
+        *wrong,
         listing(main),
         f"<details><summary>All metrics of the task</summary>{listing(others)}</details>" if others else "",
     ]

@@ -7,6 +7,7 @@ actions).
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -19,6 +20,7 @@ from ..errors import UsageError
 from ..files import Note
 from ..limits import WORST, Limits
 from ..tasks import columns as task_columns
+from ..training.health import faults
 from . import statistics
 from .run_log import Group, RunLog, groups
 
@@ -92,6 +94,7 @@ class Row:
       scores: {column: [seeds]} in the task's units; nan if a seed has none.
       excess: [seeds] cost beyond the limit, see `RunLog.excess`; of the cost in `scores` if None.
       true_limits: on true costs; None if unknown.
+      faults: which steps broke the contract of tasks, in a sentence; empty if none did.
     """
 
     task: str
@@ -103,6 +106,7 @@ class Row:
     scores: dict[str, np.ndarray]
     excess: np.ndarray | None = None
     true_limits: Limits | None = None
+    faults: str = ""
 
     def score(self, column: str) -> np.ndarray:
         """[seeds] of a column, nan if the row does not have it; where agents share costs, all are the worst agent."""
@@ -167,6 +171,10 @@ def _row(group: Group) -> Row:
         scores={name: x for name, x in scores.items() if x is not None},
         excess=np.concatenate([run.excess for run in group.runs]),
         true_limits=first.true_limits,
+        faults=faults(
+            sum((run.faults for run in group.runs), collections.Counter()),
+            sum(len(run.seeds) * int(run.steps[-1]) for run in group.runs),
+        ),
     )
 
 

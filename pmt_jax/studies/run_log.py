@@ -5,6 +5,7 @@ Tables, plots and reports all read through here.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import json
 import math
@@ -19,6 +20,7 @@ from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
 from ..limits import KEY, LARGEST, WORST, Limits, judged, of_agents
+from ..training.health import count_faults
 from ..training.history import checkpoint_steps, missing_rows, read_changes
 from . import program_folder
 
@@ -127,6 +129,11 @@ class RunLog:
         unknown = np.full(len(self.seeds), np.nan)
         each = [[unknown if (x := self._final(column)) is None else x for column in costs] for costs in names]
         return np.moveaxis(np.array(each), -1, 0)
+
+    @property
+    def faults(self) -> collections.Counter[str]:
+        """How many steps of all seeds broke the contract of tasks (`health.count_faults`)."""
+        return count_faults(self.metrics, self.settings.get("eval_episodes", 0))
 
     def until(self, step: int) -> RunLog:
         """The same run as if it had ended after this step.

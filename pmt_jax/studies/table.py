@@ -153,6 +153,7 @@ def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str |
         "Interquartile mean over seeds, below four the mean [95 % studentised interval]; -: unknown, or not finite for "
         "some seed; [-]: one seed has no interval.",
     ]
+    notes += [f"{row.label} on {row.task}: {row.faults}." for row in table if row.faults]
     if baseline:
         notes.append(f"P: probability that a seed of the row does better than a seed of {baseline}; ties count half.")
     if test:

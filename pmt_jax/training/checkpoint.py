@@ -17,7 +17,7 @@ import os
 import pathlib
 import tomllib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -37,6 +37,7 @@ from .history import checkpoint_steps
 KEEP = 2
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
 _PROVENANCE = "provenance"  # its name in the npz, beside the paths of arrays
+_ROW = "['row']"  # before the names of what is known of a row that has not ended
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
@@ -237,6 +238,11 @@ def check_name(folder: pathlib.Path) -> None:
             f"the path {folder} is not UTF-8, which checkpoints need; rename the folder, or set PYTHONUTF8=1 if the "
             "locale has another encoding"
         ) from None
+
+
+def open_row(packed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What a checkpoint knows of a row that had not ended when it was saved: arrays by their names."""
+    return {path[len(_ROW) + 2 : -2]: x for path, x in packed.items() if path.startswith(_ROW)}
 
 
 class Checkpoints:

@@ -26,6 +26,7 @@ from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 from ..output import Say
+from . import chunks
 
 FLOAT = 4  # bytes
 KERNEL_LINES = 5.0  # seconds between two of them
@@ -36,14 +37,15 @@ class Programs(NamedTuple):
     """The compiled programs of a run; states have a leading [seeds].
 
     Attributes:
-      chunk: state -> the state `log_interval` updates later, and metrics [seeds, updates], with those of `_health`.
+      chunk: state, updates -> the state so many updates later, and metrics [seeds, chunks.most(config)], of which the
+        first `updates` count, with those of `_health`, [seeds]. Any number up to that runs the same program.
       take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
       evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       measures: the names of these metrics.
       close: ends what runs beside this process for them.
     """
 
-    chunk: Callable[[LearnerState], tuple[LearnerState, Metrics]]
+    chunk: Callable[[LearnerState, int], tuple[LearnerState, Metrics]]
     take: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
     evaluate: Callable[[LearnerState], Metrics] | None = None
     measures: tuple[str, ...] = ()
@@ -115,7 +117,7 @@ def cache_events() -> Iterator[list[str]]:
 def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
     config = setup.config
-    say(f"compiling {config.log_interval} update(s) of {config.method} on {setup.vector.spec.name} ...")
+    say(f"compiling {config.method} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
     with compiling(_kernels(setup, say), say):
         state, programs, found = _compile_programs(setup, say)
@@ -133,15 +135,16 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     everywhere = sharding.replicated(setup.mesh)
     state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(_options(once=True))(hyper, keys)
 
-    def chunk(hyper: Any, state: LearnerState) -> tuple[LearnerState, Metrics]:
-        state, metrics = learner.train_chunk(setup, hyper, state, config.log_interval)
+    def chunk(hyper: Any, state: LearnerState, updates: jax.Array) -> tuple[LearnerState, Metrics]:
+        state, metrics = learner.train_some(setup, hyper, state, updates, chunks.most(config))
         return state, {**metrics, **_health(state)}
 
-    # The state is not donated: a seed that breaks returns to it.
-    program = jax.jit(_over_seeds(setup, chunk, axes), out_shardings=(placement, everywhere))
+    # The state is not donated: a seed that breaks returns to it, and a run that fails saves it.
+    program = jax.jit(_over_seeds(setup, chunk, (*axes, None)), out_shardings=(placement, everywhere))
     with sharding.use_mesh(setup.mesh), cache_events() as events:
-        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state).compile(_options())
-    programs = Programs(functools.partial(compiled, hyper), jax.jit(take, donate_argnums=1))
+        one = np.int32(1)
+        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(_options())
+    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(take, donate_argnums=1))
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
@@ -150,6 +153,12 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
         programs = programs._replace(evaluate=evaluation, measures=tuple(evaluation.out_info))
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     return state, programs, found
+
+
+def _run_chunk(
+    program: Callable[..., tuple[LearnerState, Metrics]], hyper: Hyper, state: LearnerState, updates: int
+) -> tuple[LearnerState, Metrics]:
+    return program(hyper, state, np.int32(updates))
 
 
 def _options(once: bool = False) -> dict[str, str | bool] | None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import collections
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +16,10 @@ from .metrics import LOSSES, Row
 
 MOST = 0.5  # share of a row's steps that may be quarantined
 MAX_RETURN = 1e8  # of a critic, in units of the reward (cost) of a step
+FAULTS = {  # columns that count steps, and what these did
+    "non_finite": "were not finite: reward 0, cost 1, end of the episode",
+    "cost_out_of_range": "had a cost outside [0, 1]",
+}
 NO_ROOM = "the warp engine had no room for all contacts or constraints"
 
 
@@ -37,14 +44,14 @@ def unshared(row: Row, spread: float) -> str | None:
     )
 
 
-def diagnose(setup: Setup, index: int, row: Row, finite: bool) -> str | None:
+def diagnose(setup: Setup, index: int, row: Row, finite: bool, steps: int) -> str | None:
     """Why a seed cannot train on after this row; None if it can.
 
     Args:
       index: of the seed, from 0.
       finite: whether all its weights and moments are.
+      steps: environment steps of the row.
     """
-    steps = setup.config.batch_size * setup.config.log_interval
     share = row["non_finite"] / steps
     whose = "" if setup.trials else f"of seed {row['seed']} "
     where = f"{whose}at step {row['step']:,}"
@@ -53,11 +60,60 @@ def diagnose(setup: Setup, index: int, row: Row, finite: bool) -> str | None:
             f"{share:.0%} of the environment steps {where} were not finite; check the observations, rewards, costs and "
             f"states of task '{row['task']}'"
         )
+    if row["cost_out_of_range"]:
+        return (
+            f"{row['cost_out_of_range']:,} of the {steps:,} environment steps {whose}up to step {row['step']:,} had a "
+            f"cost outside [0, 1], the worst {row['worst_cost']:g}; scale or clip the costs of task '{row['task']}'"
+        )
     lost = [name for name in LOSSES if not math.isfinite(row[name])]
     if lost or not finite:
         what = f"{lost[0]} {where} is {row[lost[0]]}" if lost else f"a weight {where} is not finite"
         return f"{what}; {_cause(setup, index, share)}"
     return _divergence(row, where)
+
+
+def diagnose_evaluation(setup: Setup, row: Row) -> str | None:
+    """Why a seed cannot train on after the evaluation in this row; None if it can, or none was made."""
+    if not row["eval/cost_out_of_range"] > 0:
+        return None
+    whose = "" if setup.trials else f"of seed {row['seed']} "
+    return (
+        f"{row['eval/cost_out_of_range']:g} steps an episode in the evaluation {whose}at step {row['step']:,} had a "
+        f"cost outside [0, 1]; scale or clip the costs of task '{row['task']}'"
+    )
+
+
+def count_faults(metrics: Mapping[str, Any], episodes: float) -> collections.Counter[str]:
+    """How many steps broke the contract of tasks, by the names in FAULTS, `eval/` before those of evaluations.
+
+    Args:
+      metrics: rows' values by column, numbers or arrays; what is unknown is nan, None or missing.
+      episodes: of an evaluation of one seed.
+    """
+
+    def total(name: str) -> float:
+        return float(np.nansum(np.asarray(metrics.get(name), float)))
+
+    found = {name: total(name) for name in FAULTS}
+    found |= {f"eval/{name}": total(f"eval/{name}") * episodes for name in (*FAULTS, "episode_length")}
+    return collections.Counter({name: round(count) for name, count in found.items() if count})
+
+
+def faults(counts: Mapping[str, int], steps: int) -> str:
+    """What `count_faults` found, in a sentence; empty if there were no faults.
+
+    Args:
+      steps: of training, of all seeds.
+    """
+    every = {"": steps, "eval/": counts.get("eval/episode_length", 0)}
+    where = {"": "", "eval/": " in evaluations"}
+    found = [
+        f"{counts[prefix + name]:,} of {every[prefix]:,} steps{where[prefix]} {what}"
+        for prefix in every
+        for name, what in FAULTS.items()
+        if counts.get(prefix + name)
+    ]
+    return f"{'; '.join(found)}. Check the task's observations, rewards, costs and states" if found else ""
 
 
 def _cause(setup: Setup, index: int, share: float) -> str:

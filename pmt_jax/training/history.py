@@ -43,12 +43,13 @@ def row_steps(config: Config, changes: Sequence[Row], until: int) -> Iterator[in
     found = [(row["step"], row["changed"]["log_interval"].split(" -> ")) for row in changes if _has_interval(row)]
     ends = [*(min(step, until) for step, _ in found), until]
     intervals = [*(int(old) for _, (old, _) in found), config.log_interval]
-    step = 0
+    begin, last = 0, config.num_updates * config.batch_size
     for end, interval in zip(ends, intervals, strict=True):
-        chunk = interval * config.batch_size
-        while step + chunk <= end:
-            step += chunk
-            yield step
+        row = interval * config.batch_size
+        yield from range((begin // row + 1) * row, end + 1, row)
+        begin = end
+    if until == last and last % (config.log_interval * config.batch_size):
+        yield last  # the last row is what is left
 
 
 def _has_interval(row: Row) -> bool:

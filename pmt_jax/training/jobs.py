@@ -27,7 +27,7 @@ from ..errors import UsageError
 from ..learning.setup import Setup, make_setup
 from ..learning.types import LearnerState
 from ..output import Say
-from . import processes
+from . import failures, processes
 from .checkpoint import pack, unpack
 from .compile import Programs, compile_run, take
 from .run_folder import state_like
@@ -76,7 +76,7 @@ def start(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
       UsageError: what `compile_run` raises.
     """
     config = setup.config
-    say(f"compiling {config.log_interval} update(s) of {config.method} on {setup.vector.spec.name} in every worker ...")
+    say(f"compiling {config.method} on {setup.vector.spec.name} in every worker ...")
     workers = Workers(setup)
     try:
         states, measures, said = zip(*map(workers.receive, range(setup.jobs)), strict=True)
@@ -116,11 +116,15 @@ class Workers:
             part = config.replace(seed=config.seed + begin, seeds=end - begin)
             self._send(rank, (part, {name: x for name, x in jax.config.values.items() if name in SETTINGS}))
 
-    def call(self, program: str, state: LearnerState) -> Any:
-        """What every worker's `program` returns for its seeds of `state`, put together along the seeds."""
+    def call(self, program: str, state: LearnerState, updates: int = 0) -> Any:
+        """What every worker's `program` returns for its seeds of `state`, put together along the seeds.
+
+        Args:
+          updates: of `chunk`.
+        """
         packed = {} if state is self._newest else pack(state)  # the workers have what they returned last
         for rank, (begin, end) in enumerate(self._bounds):
-            self._send(rank, (program, {path: x[begin:end] for path, x in packed.items()}))
+            self._send(rank, (program, {path: x[begin:end] for path, x in packed.items()}, updates))
         results = [self.receive(rank) for rank in range(len(self._bounds))]
         if program == "evaluate":
             return _joined(results)
@@ -183,21 +187,26 @@ def serve() -> None:
         jax.config.update(name, value)
     said: list[str] = []
     try:
-        state, programs = compile_run(make_setup(config), said.append)
+        with failures.named():
+            state, programs = compile_run(make_setup(config), said.append)
     except UsageError as error:
         pipe.send(error)
         return
     pipe.send((pack(state), programs.measures, said[-1]))
     with contextlib.suppress(EOFError, ConnectionError):  # a run that was killed may leave a result unread
         while True:
-            program, packed = pipe.recv()
+            program, packed, updates = pipe.recv()
             given = unpack(packed, state) if packed else state
-            if program == "evaluate":
-                assert programs.evaluate
-                pipe.send(jax.device_get(programs.evaluate(given)))
-            else:
-                state, metrics = programs.chunk(given)
-                pipe.send((pack(state), jax.device_get(metrics)))
+            try:
+                with failures.named():
+                    if program == "evaluate":
+                        assert programs.evaluate
+                        pipe.send(jax.device_get(programs.evaluate(given)))
+                    else:
+                        state, metrics = programs.chunk(given, updates)
+                        pipe.send((pack(state), jax.device_get(metrics)))
+            except failures.Failed as failed:
+                pipe.send(failed)
 
 
 def _end_with_parent() -> None:

@@ -13,7 +13,7 @@ from ..learning.setup import Setup
 from ..limits import WORST, Limits, base, judged, of_agents
 from .history import Row
 
-Reduction = Literal["mean", "episodes", "sum", "loss"]
+Reduction = Literal["mean", "episodes", "sum", "loss", "worst"]
 
 
 class Metric(NamedTuple):
@@ -24,6 +24,7 @@ class Metric(NamedTuple):
       definition: what it measures, over the updates of one row.
       reduction: how the updates of a row become one value. `mean` leaves out what is not finite, `loss` does not: a
         loss that was not finite even once must show. `episodes` weighs each update by the episodes that ended in it.
+        `worst` is the one farthest from [0, 1].
     """
 
     unit: str
@@ -68,6 +69,8 @@ METRICS: dict[str, Metric] = {
     "true_violation_rate": Metric("", "violation_rate of what the costs were"),
     "true_step_cost": Metric("cost", "step_cost of what the costs were"),
     "non_finite": Metric("steps", "steps that were not finite and were quarantined: reward 0, cost 1, reset", "sum"),
+    "cost_out_of_range": Metric("steps", "steps with a cost outside [0, 1]; they stop the seed", "sum"),
+    "worst_cost": Metric("cost", "the cost farthest outside [0, 1]; null if all are within", "worst"),
     "lambda": Metric("", "the multiplier, with the gains of PID, mean over agents and costs; 0 without one"),
     "cost_excess": Metric(
         "cost per step",
@@ -182,6 +185,8 @@ def _reduce(name: str, values: np.ndarray, episodes: np.ndarray) -> float | int:
     if reduction == "loss":
         return float(values.mean())
     seen = np.isfinite(values)
+    if reduction == "worst" and seen.any():
+        return float(values[seen][np.abs(values[seen] - 0.5).argmax()])
     weights = episodes[seen] if reduction == "episodes" else None
     return float(np.average(values[seen], weights=weights)) if seen.any() else math.nan
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 
 from ..output import Say, dropped_if_closed
 
+PATIENCE = 10.0  # seconds that a signal waits for the running chunk, which may be a single long update
 CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SHOW_CURSOR = "\x1b[?25h"
 
@@ -43,6 +44,8 @@ def noted() -> Iterator[list[int]]:
 class Interrupts:
     """How a run handles signals: it ends at once, but after `save_first` it ends when the running chunk is saved.
 
+    A chunk that takes longer than `PATIENCE` is given up: what was trained before it is saved.
+
     Python's handlers wait for C++ to return, from compiling or from a long chunk. A thread reads the signals at once.
 
     Attributes:
@@ -53,12 +56,17 @@ class Interrupts:
         """`before_exit` is called before the process ends at once."""
         self.received: list[int] = []
         self._say, self._before_exit = say, before_exit
-        self._saves = False
+        self._rescue: Callable[[], str] | None = None
         self._stack = contextlib.ExitStack()
 
-    def save_first(self) -> None:
-        """From now on a signal is only noted; a second Ctrl-C still ends the process at once."""
-        self._saves = True
+    def save_first(self, rescue: Callable[[], str]) -> None:
+        """From now on a signal is only noted; a second Ctrl-C still ends the process at once.
+
+        Args:
+          rescue: called from another thread if the chunk does not end; saves what was trained before it and returns
+            what to print, or "" to wait on.
+        """
+        self._rescue = rescue
 
     def __enter__(self) -> Interrupts:
         self.received = self._stack.enter_context(noted())
@@ -84,15 +92,27 @@ class Interrupts:
         while data := pipe.recv(1):
             number = data[0]
             if number in CAUGHT:
-                self._answer(number, at_once=not self._saves or (interrupted and number == signal.SIGINT))
+                self._answer(number, at_once=self._rescue is None or (interrupted and number == signal.SIGINT))
             interrupted |= number == signal.SIGINT
 
     def _answer(self, number: int, at_once: bool) -> None:
         if not at_once:
             self._say("interrupted: saving after the running chunk; Ctrl-C again ends at once, without saving")
+            timer = threading.Timer(PATIENCE, self._give_up, [number])
+            timer.daemon = True
+            self._stack.callback(timer.cancel)
+            timer.start()
             return
-        what = "what was not saved is lost" if self._saves else "nothing new was trained yet"
-        self._say(f"interrupted: {what}")
+        what = "what was not saved is lost" if self._rescue else "nothing new was trained yet"
+        self._end(number, f"interrupted: {what}")
+
+    def _give_up(self, number: int) -> None:
+        assert self._rescue is not None  # without it a signal does not wait
+        if sentence := self._rescue():
+            self._end(number, sentence)
+
+    def _end(self, number: int, sentence: str) -> None:
+        self._say(sentence)
         self._before_exit()
         with dropped_if_closed():
             if sys.stdout.isatty():  # the live table has hidden the cursor

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import math
 import os
 import pathlib
 import shlex
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..config import load
@@ -24,8 +27,8 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import claims, health, jobs, processes
-from .checkpoint import unpack
+from . import chunks, claims, failures, health, jobs, processes
+from .checkpoint import open_row, unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
@@ -74,7 +77,7 @@ def train(
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
-      trial) broke, `debug` found something, or the folder is gone or could not be written any more.
+      trial) broke, `debug` found something, a program failed, or the folder is gone or could not be written any more.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
@@ -95,7 +98,8 @@ def train(
         _describe(setup, folder.path, say)
         if cache:
             use_cache()
-        state, programs = (jobs.start if workers > 1 else compile_run)(setup, say)
+        with failures.named():
+            state, programs = (jobs.start if workers > 1 else compile_run)(setup, say)
         stack.callback(programs.close)
         trainer = Trainer(setup, programs, begin(state) if begin else state, folder, say)
         return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
@@ -127,8 +131,8 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
     except NotFinite as found:
         trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
         return 1
-    except jobs.Lost as lost:
-        trainer.say(f"stopped: {lost}; saved as of step {trainer.step:,}. Continue with: {trainer.command}")
+    except (failures.Failed, jobs.Lost) as failure:
+        trainer.say(f"stopped: {failure}; {trainer.saved}. Continue with: {trainer.command}")
         return 1
     except OSError as error:
         with contextlib.suppress(OSError):  # what could not be written cannot be flushed either
@@ -180,7 +184,12 @@ class Trainer:
         self.state, self.best = state, initial_best(state)
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
+        self.faults: collections.Counter[str] = collections.Counter()
         self.total = self.config.num_updates * self.config.batch_size
+        self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, 0
+        self._speed: float | None = None  # seconds that an update took in the last chunk
+        self._busy = threading.Lock()  # held by whoever may change or save what is below, except while programs run
+        self._busy.acquire()
         self._signal = 0
         self._progress: Progress | None = None
         self._is_open = False
@@ -205,13 +214,16 @@ class Trainer:
 
     def _restore(self) -> None:
         """Continues from the newest checkpoint, if there is one."""
-        tree = {"last": self.state, "best": self.best}
+        tree, row = {"last": self.state, "best": self.best}, {}
         if saved := self.folder.saved:
-            self.step, tree = saved.step, unpack(saved.packed, tree)
+            self.step, tree, row = saved.step, unpack(saved.packed, tree), open_row(saved.packed)
         rows = self.folder.resume(self.step, ended=self.step >= self.total)
         self.say(f"resuming after {self.step:,} steps")
-        self.seconds = rows[-1]["seconds"] if rows else 0.0
-        self.state = sharding.place(self.setup.mesh, tree["last"])
+        seconds = row.pop("seconds", rows[-1]["seconds"] if rows else 0.0)
+        self._row, self.seconds = chunks.OpenRow.of(row), float(seconds)
+        for each in rows:
+            self.faults += health.count_faults(each, self.config.eval_episodes)
+        self.state = self._row_start = sharding.place(self.setup.mesh, tree["last"])
         best = tree["best"]
         self.best = dataclasses.replace(best, state=sharding.place(self.setup.mesh, best.state))
         if self.setup.debug:  # a seed that broke goes on from its last finite state, to be looked at
@@ -228,25 +240,55 @@ class Trainer:
         """Trains until done, interrupted, or no seed can train on; saves at intervals and at the end."""
         begin = saved = time.monotonic()
         before = self.seconds
-        interrupts.save_first()
+        interrupts.save_first(self._rescue)
         while self.step < self.total and not self.all_broken and not self._agree_to_stop(interrupts):
             self._profile.before_chunk()
-            before_chunk = self.state, self.step
+            self._before = self.state, self.step, self._row, self._row_start, dict(self.broken)
             try:
-                rows = self._train_chunk()
-                self._evaluate(rows)
-            except (NotFinite, jobs.Lost):
-                self.state, self.step = before_chunk
-                self._save()
+                with failures.named(), self._others_may_save():
+                    rows = self._train_chunk()
+                    self._evaluate(rows)
+            except BaseException as error:
+                self._go_back()
+                self._save_before(error)
                 raise
             self.seconds = before + time.monotonic() - begin
-            self._log(rows)
-            self._keep_best(rows)
+            if rows:
+                self._log(rows)
+                self._keep_best(rows)
             self.folder.check()
             if processes.agree(time.monotonic() - saved > CHECKPOINT_SECONDS):
                 self._save()
                 saved = time.monotonic()
         self._save()
+
+    @contextlib.contextmanager
+    def _others_may_save(self) -> Iterator[None]:
+        """While programs run inside, another thread may end the process (see `_rescue`)."""
+        self._busy.release()
+        try:
+            yield
+        finally:
+            self._busy.acquire()
+
+    def _go_back(self) -> None:
+        """Forgets what came after the last whole chunk."""
+        self.state, self.step, self._row, self._row_start, self.broken = self._before
+
+    def _rescue(self) -> str:
+        """Saves the state before a chunk that takes too long; the last words of the process, "" if it must wait."""
+        if jax.process_count() > 1:  # all would have to save at the same point
+            return ""
+        self._busy.acquire()  # and never released: the process ends
+        self._go_back()
+        try:
+            with contextlib.suppress(jax.errors.JaxRuntimeError):
+                self._save()
+        except claims.Gone as gone:
+            return self.rescue(gone)
+        except OSError as error:
+            return self.write_failure(error)
+        return f"interrupted in a long chunk: {self.saved}. Continue with: {self.command}"
 
     @property
     def all_broken(self) -> bool:
@@ -259,48 +301,67 @@ class Trainer:
         return self._signal > 0
 
     def _train_chunk(self) -> list[Row]:
-        """Trains all seeds for `log_interval` updates; those that break stay where they were."""
-        begin = time.monotonic()
-        state, metrics = self.programs.chunk(self.state)
-        metrics = jax.device_get(metrics)
-        self._rate = self.config.seeds * self.config.log_interval * self.config.batch_size / (time.monotonic() - begin)
-        finite, spread = metrics.pop("finite"), metrics.pop("cost_spread", np.zeros((self.config.seeds, 1)))
-        self.step += self.config.log_interval * self.config.batch_size
-        rows = make_rows(self.setup, self.step, metrics)
-        gone = dict(self.broken)
-        self._find_broken(rows, finite, spread.max(1))
+        """Trains all seeds for some updates; the rows, if one ends with them.
+
+        Seeds that break stay where they were when the row began.
+        """
+        done, begin = self.step // self.config.batch_size, time.monotonic()
+        updates = processes.agree(chunks.plan(self.config, done, self._speed))
+        state, metrics = self.programs.chunk(self.state, updates)
+        self._row = self._row.then(updates, jax.device_get(metrics))
+        self._speed = (time.monotonic() - begin) / updates
+        self.step += updates * self.config.batch_size
+        gone, rows = dict(self.broken), []
+        lost = [i in self.broken or hopeless for i, hopeless in enumerate(self._row.hopeless)]
+        if done + updates == chunks.row_end(self.config, done) or all(lost):
+            rows = self._end_row()
         if self.broken:
             broken = np.array([i in self.broken for i in range(self.config.seeds)])
-            state = self.programs.take(broken, state, self.state)  # self.state stays whole: `train` may go back to it
+            state = self.programs.take(broken, state, self._row_start)  # which stays whole: `train` may go back to it
         self.state = state
+        if rows:
+            self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, self._row.updates
         for i, reason in self.broken.items():
-            rows[i] = without_metrics(rows[i], reason) if i in gone else rows[i] | {"broken": reason}
+            if rows:
+                rows[i] = without_metrics(rows[i], reason) if i in gone else rows[i] | {"broken": reason}
         return rows
 
-    def _find_broken(self, rows: list[Row], finite: np.ndarray, spread: np.ndarray) -> None:
+    def _end_row(self) -> list[Row]:
+        """The rows of the updates since the last ones, and which seeds broke meanwhile."""
+        metrics = dict(self._row.metrics)
+        finite, spread = metrics.pop("finite"), metrics.pop("cost_spread", np.zeros((self.config.seeds, 1)))
+        rows = make_rows(self.setup, self.step, metrics)
         overflow = health.overflow(self.setup, [row for i, row in enumerate(rows) if i not in self.broken])
+        steps = self._row.updates * self.config.batch_size
         for i, row in enumerate(rows):
-            reason = overflow or health.unshared(row, spread[i]) or health.diagnose(self.setup, i, row, bool(finite[i]))
+            reason = overflow or health.unshared(row, spread[i].max())
+            reason = reason or health.diagnose(self.setup, i, row, bool(finite[i]), steps)
             if reason and i not in self.broken:
                 self.broken[i] = reason
+        return rows
 
     def _evaluate(self, rows: list[Row]) -> None:
         """Adds the columns of an evaluation, nan if none is due."""
-        if self.programs.evaluate is None:
+        if self.programs.evaluate is None or not rows:
             return
-        updates = self.step // self.config.batch_size
-        due = updates % self.config.eval_interval < self.config.log_interval and not self.all_broken
+        updates, interval = self.step // self.config.batch_size, self.config.eval_interval
+        # A whole multiple of the interval is among the updates of the row.
+        due = updates % interval < self._row_updates and not self.all_broken
         nothing = dict.fromkeys(self.programs.measures, (math.nan, math.nan))
         results = seed_intervals(jax.device_get(self.programs.evaluate(self.state))) if due else [nothing] * len(rows)
         for i, (row, result) in enumerate(zip(rows, results, strict=True)):
             row |= evaluation_columns(nothing if i in self.broken else result)
+            if reason := health.diagnose_evaluation(self.setup, row):
+                self.broken[i] = row["broken"] = reason
 
     def _log(self, rows: list[Row]) -> None:
         for row in rows:
             row["seconds"] = round(self.seconds, 3)
+            self.faults += health.count_faults(row, self.config.eval_episodes)
         self.folder.log(rows)
         if self._progress:
-            self._progress.show(rows, self._rate)
+            assert self._speed is not None  # a chunk has ended
+            self._progress.show(rows, self.config.seeds * self.config.batch_size / self._speed)
 
     def _keep_best(self, rows: list[Row]) -> None:
         """Keeps each seed's state if it is the best so far, by the evaluation if there is one, else by training."""
@@ -317,11 +378,31 @@ class Trainer:
 
     @property
     def _tree(self) -> dict[str, Any]:
-        """What a checkpoint holds."""
-        return {"last": self.state, "best": self.best}
+        """What a checkpoint holds: the states, and what is known of a row that has not ended."""
+        state = self.state
+        lost = ~np.asarray(self._row.metrics.get("finite", np.ones(self.config.seeds, bool)))
+        if lost.any():  # the end of the row will say why
+            state = self.programs.take(lost, jax.tree.map(jnp.copy, state), self._row_start)
+        row = dict(self._row.metrics) | {"seconds": np.float64(self.seconds)}
+        return {"last": state, "best": self.best, "row": row}
 
     def _save(self) -> None:
         self.folder.save(self.step, self._tree)
+
+    def _save_before(self, error: BaseException) -> None:
+        """Saves the state before the chunk in which `error` was raised, if the device still returns it."""
+        if not isinstance(error, Exception) or jax.process_count() > 1:  # others would wait for this one for ever
+            return
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            self._save()
+
+    @property
+    def saved(self) -> str:
+        """How much of the run its newest checkpoint holds, in words."""
+        newest = next(iter(self.folder.checkpoints.steps()), None)
+        if newest == self.step:
+            return f"saved as of step {self.step:,}"
+        return "nothing could be saved" if newest is None else f"what came after step {newest:,} could not be saved"
 
     # -----------------------------------------------------------------------------------------------------------------
     # The end
@@ -329,6 +410,8 @@ class Trainer:
     def finish(self) -> int:
         """Prints how training ended and what to do next; returns the exit code."""
         self._list_broken()
+        if wrong := health.faults(self.faults, self.step * self.config.seeds):
+            self.say(f"note: {wrong}")
         if self.step < self.total and not self.all_broken:
             self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self.command}")
             return 128 + self._signal

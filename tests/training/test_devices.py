@@ -49,8 +49,8 @@ def train(count, task, **sizes):
     config = load_config(task, rollout_length=4, hidden=(8,), minibatches=2, log_interval=2, **sizes)
     run = dataclasses.replace(make_setup(config), mesh=sharding.make_mesh(config, count))
     state, programs = compile_run(run, lambda _: None)
-    program = programs.chunk.func.as_text()
-    state, metrics = programs.chunk(state)
+    program = programs.chunk.args[0].as_text()
+    state, metrics = programs.chunk(state, 2)
     return program, {**checkpoint.pack(state), **{k: np.asarray(x) for k, x in metrics.items()}}
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])

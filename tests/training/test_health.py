@@ -28,8 +28,8 @@ def breaking(monkeypatch: pytest.MonkeyPatch, updates: dict[int, int]) -> None:
     def compile_breaking(*arguments: Any) -> Any:
         state, programs = compile_run(*arguments)
 
-        def chunk(state: Any) -> Any:
-            state, metrics = programs.chunk(state)
+        def chunk(state: Any, number: int) -> Any:
+            state, metrics = programs.chunk(state, number)
             bad = np.array([updates.get(i, 10**9) <= n for i, n in enumerate(np.asarray(state.update))])
             params = jax.tree.map(
                 lambda x: jnp.where(bad.reshape(-1, *[1] * (x.ndim - 1)), jnp.nan, x), state.actor.params
@@ -101,7 +101,13 @@ def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypa
 
 def row(**changes: float) -> dict[str, Any]:
     """A row of a seed that is well, but for `changes`; `/` is written `__`."""
-    well = dict.fromkeys(LOSSES, 0.5) | {"step": 100, "seed": 3, "task": "lane", "non_finite": 0}
+    well = dict.fromkeys(LOSSES, 0.5) | {
+        "step": 100,
+        "seed": 3,
+        "task": "lane",
+        "non_finite": 0,
+        "cost_out_of_range": 0,
+    }
     well |= {"step_reward": 0.1, "step_cost": 0.1}
     well |= {f"{c}/return_{m}": 5.0 for c in ("critic", "cost_critic") for m in ("mean", "std")}
     return well | {name.replace("__", "/"): x for name, x in changes.items()}
@@ -124,7 +130,7 @@ def row(**changes: float) -> dict[str, Any]:
 )
 def test_the_cause_is_told_apart(changes: dict[str, float], settings: dict[str, float], says: str | None):
     setup = make_setup(load_config("lane", num_envs=4, rollout_length=25, minibatches=1, log_interval=1, **settings))
-    found = health.diagnose(setup, 0, row(**changes), finite=True)
+    found = health.diagnose(setup, 0, row(**changes), finite=True, steps=100)
     assert found is None if says is None else says in str(found)
 
 

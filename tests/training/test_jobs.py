@@ -104,7 +104,7 @@ def test_a_worker_says_nothing_when_its_run_ends_with_a_result_unread():
         theirs.close()
         ours.send((load_config("lane", num_envs=2, rollout_length=4, seeds=1), {}))
         ours.recv()
-        ours.send(("chunk", {}))
+        ours.send(("chunk", {}, 1))
         assert ours.poll(60)
         ours.close()
         assert process.wait(60) == 0 and process.stderr and process.stderr.read() == ""

@@ -33,7 +33,7 @@ def die(event, arguments):
     global saves
     if event == "os.rename" and str(arguments[0]).endswith("00.orbax-checkpoint-tmp"):
         saves += 1
-        if saves == 4:  # everything is written, but not yet under its name
+        if saves == 5:  # everything is written, but not yet under its name
             os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(die)

@@ -91,3 +91,46 @@ def test_a_closed_pipe_silences_the_output_and_training_continues(whole: pathlib
     done = subprocess.run(["bash", "-c", command], env=environment(), capture_output=True, text=True)
     assert done.returncode == 0 and not done.stderr and done.stdout.count("\n") == 2
     assert_same_run(tmp_path / "run", whole)
+
+
+LONG_UPDATE = """
+import hashlib, signal, sys, threading
+from pmt_jax.cli import main
+from pmt_jax.training import signals, trainer
+
+signals.PATIENCE = 0.0
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
+compile_run, calls = trainer.compile_run, []
+
+def compile_slowly(setup, say):
+    state, programs = compile_run(setup, say)
+
+    def chunk(state, updates):
+        calls.append(updates)
+        if len(calls) < 4:
+            return programs.chunk(state, updates)
+        print("busy", flush=True)
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # minutes, in which no Python of this thread runs
+
+    return state, programs._replace(chunk=chunk)
+
+trainer.compile_run = compile_slowly
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.full)])
+def test_an_update_that_takes_too_long_is_given_up_and_what_was_trained_is_saved(
+    number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli
+):
+    out = tmp_path / "run"
+    words = [str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", out)]
+    command = [sys.executable, "-c", LONG_UPDATE, *words]
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout and any(line == "busy\n" for line in process.stdout)
+    process.send_signal(number)
+    text, err = process.communicate(timeout=120)
+    assert process.returncode == 128 + number and not err and not (out / ".claim").exists()
+    assert "interrupted in a long chunk: saved as of step 400. Continue with: pmt train" in text
+    assert cli(*words, "--resume")[0] == 0
+    assert_same_run(out, whole)
