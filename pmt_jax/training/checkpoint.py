@@ -146,7 +146,7 @@ class Checkpoints:
     def load(self, like: Any, warn: Callable[[str], object]) -> tuple[int, Any]:
         """The newest checkpoint that is whole: its step, and its tree in the structure of `like`, a dictionary.
 
-        The tree's `row`, arrays by their names, has no structure: it is what was saved, {} if nothing was.
+        The tree's `row`, arrays [seeds, ...] by their names, has no structure: it is what was saved, {} if nothing was.
 
         Args:
           warn: called with a sentence for every newer one that cannot be read.

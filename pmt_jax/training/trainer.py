@@ -235,7 +235,7 @@ class Trainer:
         open_steps = self._row.updates * self.config.batch_size
         rows = processes.by_first(lambda: run_folder.keep_rows_until(self.out, self.step, self.say, open_steps))
         self.say(f"resuming after {self.step:,} steps")
-        self.seconds = float(seconds) if seconds is not None else rows[-1]["seconds"] if rows else 0.0
+        self.seconds = float(seconds[0]) if seconds is not None else rows[-1]["seconds"] if rows else 0.0
         for each in rows:
             self.faults += health.count_faults(each, self.config.eval_episodes)
         self.state = self._row_start = sharding.place(self.setup.mesh, saved["last"])
@@ -398,7 +398,7 @@ class Trainer:
         lost = ~np.asarray(self._row.metrics.get("finite", np.ones(self.config.seeds, bool)))
         if lost.any():  # the end of the row will say why
             state = self.programs.take(lost, jax.tree.map(jnp.copy, state), self._row_start)
-        row = dict(self._row.metrics) | {"seconds": np.float64(self.seconds)}
+        row = dict(self._row.metrics) | {"seconds": np.full(self.config.seeds, self.seconds)}
         self.checkpoints.save(self.step, {"last": state, "best": self.best, "row": row})
 
     def _save_before(self, error: BaseException) -> None:
