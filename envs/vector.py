@@ -102,9 +102,10 @@ class VectorEnv:
         """
         before = state.env
         after = jax.vmap(self.env.step)(before, action)
-        # The state without `info` decides alone. The whole state's check changes no truth, but without it XLA fuses the
-        # programs of some tasks otherwise, and their last bits would differ from those of earlier runs.
-        bad = ~(_finite(after) | _finite(dataclasses.replace(after, info={})))
+        # The same as: not _finite of the state without `info`. So written, the programs of all tasks that were
+        # compared keep their last bits, which depend on what XLA fuses.
+        only_info = ~_finite(after.info) & _finite(dataclasses.replace(after, info={}))
+        bad = ~(_finite(after) | only_info)
         terminated = after.terminated | bad
         elapsed = state.elapsed + 1
         truncated = (elapsed >= self.horizon) & ~terminated
@@ -177,14 +178,14 @@ def out_of_range(cost: jax.Array) -> jax.Array:
     return (cost < -ROUNDING) | (cost > 1 + ROUNDING)
 
 
-def _finite(state: State) -> jax.Array:
-    """[B] bool: every floating number of an environment's state is finite."""
+def _finite(tree: Any) -> jax.Array:
+    """[B] bool (or [], of no numbers): every floating number of a tree with a leading [B] is finite."""
     checks = [
         jnp.isfinite(x).reshape(x.shape[0], -1).all(axis=1)
-        for x in jax.tree.leaves(state)
+        for x in jax.tree.leaves(tree)
         if jnp.issubdtype(x.dtype, jnp.floating)
     ]
-    return jnp.stack(checks).all(axis=0)
+    return jnp.stack(checks).all(axis=0) if checks else jnp.asarray(True)
 
 
 def _where(mask: jax.Array, chosen: Any, otherwise: Any) -> Any:

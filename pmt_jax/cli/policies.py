@@ -102,7 +102,7 @@ def _say_row(row: dict[str, Any]) -> None:
     width = max(24, *map(len, metrics))
     for name, (mean, half) in metrics.items():
         result(f"  {name:{width}} {mean:12.4f}" + ("" if math.isnan(half) else f" +- {half:.4f}"))
-    if row["faults"]:
+    if row.get("faults"):
         result(f"  note: {row['faults']}")
 
 

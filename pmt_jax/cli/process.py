@@ -54,6 +54,8 @@ def answer(name: str, command: Callable[[], int]) -> int:
             raise
         from ..training import failures
 
+        if not str(error).startswith(failures.NO_MEMORY):  # outside of a run's programs it is a mistake of ours
+            raise
         return _refuse(name, failures.explain(error))
 
 

@@ -241,7 +241,7 @@ def check_name(folder: pathlib.Path) -> None:
 
 
 def open_row(packed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a checkpoint knows of a row that had not ended when it was saved: arrays by their names."""
+    """What a checkpoint knows of a row that had not ended when it was saved: arrays [seeds, ...] by their names."""
     return {path[len(_ROW) + 2 : -2]: x for path, x in packed.items() if path.startswith(_ROW)}
 
 

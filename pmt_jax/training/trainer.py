@@ -219,8 +219,8 @@ class Trainer:
             self.step, tree, row = saved.step, unpack(saved.packed, tree), open_row(saved.packed)
         rows = self.folder.resume(self.step, ended=self.step >= self.total)
         self.say(f"resuming after {self.step:,} steps")
-        seconds = row.pop("seconds", rows[-1]["seconds"] if rows else 0.0)
-        self._row, self.seconds = chunks.OpenRow.of(row), float(seconds)
+        seconds = row.pop("seconds", np.array([rows[-1]["seconds"] if rows else 0.0]))
+        self._row, self.seconds = chunks.OpenRow.of(row), float(seconds[0])
         for each in rows:
             self.faults += health.count_faults(each, self.config.eval_episodes)
         self.state = self._row_start = sharding.place(self.setup.mesh, tree["last"])
@@ -383,7 +383,7 @@ class Trainer:
         lost = ~np.asarray(self._row.metrics.get("finite", np.ones(self.config.seeds, bool)))
         if lost.any():  # the end of the row will say why
             state = self.programs.take(lost, jax.tree.map(jnp.copy, state), self._row_start)
-        row = dict(self._row.metrics) | {"seconds": np.float64(self.seconds)}
+        row = dict(self._row.metrics) | {"seconds": np.full(self.config.seeds, self.seconds)}
         return {"last": state, "best": self.best, "row": row}
 
     def _save(self) -> None:

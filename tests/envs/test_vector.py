@@ -80,6 +80,18 @@ def test_a_step_that_is_not_finite_is_quarantined_alone():
     np.testing.assert_array_equal(state.elapsed, [0, 2])
 
 
+@pytest.mark.parametrize("info", [{}, {"count": jnp.int32(3)}])
+def test_info_without_floating_numbers(info: dict[str, jax.Array]):
+    class Quiet(Fragile):
+        def _state(self, *arguments, **named):
+            return dataclasses.replace(super()._state(*arguments, **named), info=info)
+
+    reset, step = programs(Quiet(), 2, horizon=9)
+    state, outcome = step(reset(jax.random.key(0)), jnp.stack([jnp.full((2, 2), -1.0), jnp.full((2, 2), 0.5)]))
+    np.testing.assert_array_equal(outcome.non_finite, [True, False])
+    np.testing.assert_array_equal(state.elapsed, [0, 1])
+
+
 def test_keys_of_resets_never_repeat():
     reset, step = programs(envs.make("noisy"), 4, horizon=1)
     state = reset(jax.random.key(0))
