@@ -18,7 +18,7 @@ import envs
 from envs import physics
 from envs.ant import corridor
 from envs.errors import TaskError
-from envs.physics import contract, mjx_patches, thread_team, warp_engine
+from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
 from places import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
@@ -371,7 +371,7 @@ def test_room_for_contacts_in_warp():
 
 
 def test_flattened_turns_any_vmap_into_one_batch():
-    doubled = warp_engine._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+    doubled = batching.flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
 
     def lone(x, y):
         return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))
