@@ -3,7 +3,7 @@
 
 DEVICE bool is_sound(const float* x, int size, int lane) {
   bool sound = true;
-  for (int i = lane; i < size; i += LANES) sound = sound && is_finite(x[i]);
+  ROLLED for (int i = lane; i < size; i += LANES) sound = sound && is_finite(x[i]);
   return sound;
 }
 
@@ -27,16 +27,16 @@ fused_step(const float* __restrict__ qpos, const float* __restrict__ qvel, const
                      is_sound(ctrl, NU, lane);
   if (!__all_sync(0xffffffffu, sound)) {  // broken before the step: all of it is not a number, and nothing else is
     const float nan = __int_as_float(0x7fc00000);
-    for (int i = lane; i < NQ; i += LANES) new_qpos[i] = nan;
-    for (int i = lane; i < NV; i += LANES) new_qvel[i] = new_warmstart[i] = nan;
+    ROLLED for (int i = lane; i < NQ; i += LANES) new_qpos[i] = nan;
+    ROLLED for (int i = lane; i < NV; i += LANES) new_qvel[i] = new_warmstart[i] = nan;
     repeat<0, READINGS>([&](auto r) {
-      for (int i = lane; i < READING_COUNT[r] * READING_WIDTH[r]; i += LANES) out.reading[r][i] = nan;
+      ROLLED for (int i = lane; i < READING_COUNT[r] * READING_WIDTH[r]; i += LANES) out.reading[r][i] = nan;
     });
     if (lane == 0) overflow[world] = 0;
     return;
   }
   clear(w);
-  for (int i = lane; i < NQ; i += LANES) w.qpos[i] = qpos[i];
+  ROLLED for (int i = lane; i < NQ; i += LANES) w.qpos[i] = qpos[i];
   if (lane < NV) {
     w.qvel[lane] = qvel[lane];
     w.qacc[lane] = warmstart[lane];
@@ -45,7 +45,7 @@ fused_step(const float* __restrict__ qpos, const float* __restrict__ qvel, const
   MEET();
   bool lost = false;
   control_step(w, out, lost);
-  for (int i = lane; i < NQ; i += LANES) new_qpos[i] = w.qpos[i];
+  ROLLED for (int i = lane; i < NQ; i += LANES) new_qpos[i] = w.qpos[i];
   if (lane < NV) {
     new_qvel[lane] = w.qvel[lane];
     new_warmstart[lane] = w.qacc[lane];

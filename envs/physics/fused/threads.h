@@ -19,7 +19,9 @@ typedef REAL real;
 #ifdef __CUDACC__
 #define DEVICE static __device__ __forceinline__
 #define MEMBER __device__ __forceinline__
-#define TABLE(type) static __device__ const type
+#define APART static __device__ __noinline__  // what runs once a step stays out of the way of what runs twenty times
+#define TABLE(type) static __device__ const __align__(16) type
+#define CONSTANT static __device__ constexpr
 #define EACH_LANE if (const int lane = int(threadIdx.x); true)
 #define HELD 1  // lanes whose values a thread holds
 #define ME 0    // where it holds this lane's
@@ -29,7 +31,9 @@ typedef REAL real;
 #else
 #define DEVICE static inline
 #define MEMBER inline
+#define APART static
 #define TABLE(type) static const type
+#define CONSTANT static constexpr
 #define EACH_LANE for (int lane = 0; lane < LANES; ++lane)
 #define HELD LANES
 #define ME lane

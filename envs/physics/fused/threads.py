@@ -8,12 +8,13 @@ round after the last of those that hang on it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from .model import FIELDS, Contact, Tables
+from .model import FIELDS, Contact, Impedance, Pair, Tables
 
 LANES = 32
 MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
@@ -54,6 +55,8 @@ def schedule(tables: Tables) -> Schedule:
     below = tuple(sum(d in above for above in tables.ancestors) for d in range(tables.nv))
     for d, number in enumerate(below):
         assert all(d in tables.ancestors[k] for k in range(d + 1, d + 1 + number)), "dofs are not in depth-first order"
+    first = (6, 7) if tables.has_free else (0, 0)
+    assert [(j.dof, j.qpos) for j in tables.joints] == [(first[0] + k, first[1] + k) for k in range(len(tables.joints))]
     longest = 0
     while longest < min(tables.nv, _LONGEST_TRUNK) and len(tables.ancestors[longest]) == longest:
         longest += 1
@@ -86,10 +89,34 @@ def source(tables: Tables) -> str:
 
 
 class _Writer:
-    """Lines of C++, a table a line."""
+    """Lines of C++. What differs between items of a `record` lies together, so that a lane reads it at once."""
 
     def __init__(self) -> None:
         self._lines = ["// Tables of one model, written by threads.py.", "#pragma once"]
+        self._columns: dict[str, dict[str, list[str]]] | None = None  # of the open record, by type
+        self._waiting: list[str] = []  # functions of the open record's functions
+
+    @contextlib.contextmanager
+    def record(self, name: str) -> Iterator[None]:
+        self._columns = {"real": {}, "unsigned": {}}
+        yield
+        for kind, columns in self._columns.items():
+            if columns:
+                table, width = f"{name.upper()}_{kind.upper()}_", -(-len(columns) // 4) * 4
+                pad = ["0"] * (width - len(columns))
+                rows = [", ".join([*row, *pad]) for row in zip(*columns.values(), strict=True)]
+                places = ((k, *function.split()) for k, function in enumerate(columns))
+                self._lines.append(f"TABLE({kind}) {table}[] = {{{', '.join(rows)}}};")
+                self._lines += [
+                    f"DEVICE {given} {function}(int i) {{ return {given}({table}[i * {width} + {k}]); }}"
+                    for k, given, function in places
+                ]
+        self._columns = None
+        self._lines += self._waiting
+        self._waiting = []
+
+    def _after(self, line: str) -> None:
+        (self._lines if self._columns is None else self._waiting).append(line)
 
     def text(self) -> str:
         return "\n".join(self._lines) + "\n"
@@ -106,7 +133,7 @@ class _Writer:
     def fixed(self, name: str, values: Sequence[int]) -> None:
         """Numbers that the compiler reads."""
         listed = ", ".join(str(int(v)) for v in values) or "0"
-        self._lines.append(f"constexpr int {name}[] = {{{listed}}};")
+        self._lines.append(f"CONSTANT int {name}[] = {{{listed}}};")
 
     def scalars(self, name: str, values: Iterable[float], kind: str = "real") -> None:
         """A function of an item's index; a constant if all items agree."""
@@ -115,6 +142,9 @@ class _Writer:
         if len(set(shown)) <= 1:
             self._lines.append(f"DEVICE {kind} {name}(int) {{ return {shown[0] if shown else 0}; }}")
             return
+        if self._columns is not None:
+            self._columns["real" if kind == "real" else "unsigned"][f"{kind} {name}"] = shown
+            return
         self._lines.append(f"TABLE({kind}) {name.upper()}_[] = {{{', '.join(shown)}}};")
         self._lines.append(f"DEVICE {kind} {name}(int i) {{ return {name.upper()}_[i]; }}")
 
@@ -122,13 +152,13 @@ class _Writer:
         rows = np.array(list(values), float).reshape(-1, 3)
         for k, part in enumerate("xyz"):
             self.scalars(f"{name}_{part}", rows[:, k])
-        self._lines.append(f"DEVICE Vec {name}(int i) {{ return {{{name}_x(i), {name}_y(i), {name}_z(i)}}; }}")
+        self._after(f"DEVICE Vec {name}(int i) {{ return {{{name}_x(i), {name}_y(i), {name}_z(i)}}; }}")
 
     def matrices(self, name: str, values: Iterable[np.ndarray]) -> None:
         rows = np.array(list(values), float).reshape(-1, 3, 3)
         for k, part in enumerate("abc"):
             self.vectors(f"{name}_{part}", rows[:, k])
-        self._lines.append(f"DEVICE Mat {name}(int i) {{ return {{{name}_a(i), {name}_b(i), {name}_c(i)}}; }}")
+        self._after(f"DEVICE Mat {name}(int i) {{ return {{{name}_a(i), {name}_b(i), {name}_c(i)}}; }}")
 
     def symmetric(self, name: str, values: Iterable[np.ndarray]) -> None:
         rows = np.array(list(values), float).reshape(-1, 3, 3)
@@ -136,7 +166,7 @@ class _Writer:
         for part, (i, j) in parts.items():
             self.scalars(f"{name}_{part}", rows[:, i, j])
         listed = ", ".join(f"{name}_{part}(i)" for part in parts)
-        self._lines.append(f"DEVICE Sym {name}(int i) {{ return {{{listed}}}; }}")
+        self._after(f"DEVICE Sym {name}(int i) {{ return {{{listed}}}; }}")
 
     def quats(self, name: str, values: Iterable[np.ndarray]) -> None:
         rows = np.array(list(values), float).reshape(-1, 4)
@@ -150,8 +180,8 @@ def _number(value: float) -> str:
 
 
 def _sizes(out: _Writer, t: Tables) -> None:
-    candidates = len(t.points) + len(_touches(t))
-    own = candidates <= MOST_SLOTS and t.most_contacts >= candidates
+    own = _own_slots(t)
+    columns = [len(t.bodies[p.body].chain) for p in t.points] + [len(p.dofs) for p in t.pairs]
     out.define(
         NQ=t.nq,
         NV=t.nv,
@@ -162,10 +192,11 @@ def _sizes(out: _Writer, t: Tables) -> None:
         BODIES=len(t.bodies),
         JOINTS=len(t.joints),
         POINTS=len(t.points),
-        PAIRS=len(_touches(t)),
-        CANDIDATES=candidates,
+        PAIRS=len(t.pairs),
+        SEGMENTS=len(t.segments),
         OWN_SLOTS=own,
-        SLOTS=max(1, candidates if own else min(MOST_SLOTS, t.most_contacts)),
+        SLOTS=max(1, len(t.points) if own else min(MOST_SLOTS, t.most_contacts)),
+        COLUMNS=max(columns, default=1),
         LIMITS=len(t.limits),
         FLUID=bool(t.boxes),
         BOXES=len(t.boxes),
@@ -186,66 +217,73 @@ def _sizes(out: _Writer, t: Tables) -> None:
 def _tree(out: _Writer, t: Tables) -> None:
     """Joints, bodies, dofs and motors."""
     out.line("enum { HINGE, SLIDE, SHIFT };")
-    out.scalars("joint_kind", (0 if j.hinge else 2 if j.shift else 1 for j in t.joints), "int")
-    for name in ("qpos", "dof", "body"):
-        out.scalars(f"joint_{name}", (getattr(j, name) for j in t.joints), "int")
-    out.scalars("joint_reference", (j.reference for j in t.joints))
-    for name in ("axis", "anchor", "position"):
-        out.vectors(f"joint_{name}", (getattr(j, name) for j in t.joints))
-    out.matrices("joint_rotation", (j.rotation for j in t.joints))
+    with out.record("joint"):
+        out.vectors("joint_axis", (j.axis for j in t.joints))
+        out.scalars("joint_reference", (j.reference for j in t.joints))
+        out.vectors("joint_anchor", (j.anchor for j in t.joints))
+        out.matrices("joint_rotation", (j.rotation for j in t.joints))
+        out.vectors("joint_position", (j.position for j in t.joints))
+        out.scalars("joint_kind", (0 if j.hinge else 2 if j.shift else 1 for j in t.joints), "int")
     out.quats("joint_quat", (j.quat for j in t.joints))
-    chains = [_chain(t, body) for body in range(len(t.bodies))]
-    depth = max(map(len, chains))
     out.define(
-        DEPTH=depth,
         ALL_HINGES=all(j.hinge for j in t.joints),
         TURNED_JOINTS=any((j.rotation != np.eye(3)).any() for j in t.joints),
         OFFSET_JOINTS=any(j.position.any() for j in t.joints),
     )
-    out.scalars("chain_joint", (c[k] if k < len(c) else -1 for k in range(depth) for c in chains), "int")
-    out.scalars("body_mass", (b.mass for b in t.bodies))
+    _chains(out, t)
+    with out.record("body"):
+        out.scalars("body_mass", (b.mass for b in t.bodies))
+        out.vectors("body_com", (b.com for b in t.bodies))
+        _inertias(out, t)
     out.scalars("body_subtree_mass", (b.subtree_mass for b in t.bodies))
-    out.vectors("body_com", (b.com for b in t.bodies))
-    out.symmetric("body_inertia", (b.inertia for b in t.bodies))
-    _round_bodies(out, t)
-    out.fixed("BODY_PARENT", [b.parent for b in t.bodies])
     parents = {b.parent for k, b in enumerate(t.bodies) if k}
     dragged = {box.body for box in t.boxes}
+    out.fixed("BODY_PARENT", [b.parent for b in t.bodies])
     out.fixed("BODY_CHANGES", [k in parents | dragged for k in range(len(t.bodies))])
     out.scalars("body_dofs", (_bits(b.chain) for b in t.bodies), "unsigned")
     owner = {j.dof: j.body for j in t.joints}
-    out.scalars("dof_body", (owner.get(d, 0) for d in range(t.nv)), "int")
-    for name in ("armature", "damping", "stiffness", "spring"):
-        out.scalars(f"dof_{name}", getattr(t, name))
-    out.scalars("dof_qpos", t.qpos_of_dof, "int")
-    out.scalars("motor_dof", (m.dof for m in t.motors), "int")
-    for name in ("gain", "low", "high"):
-        out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors))
-    if t.boxes:
-        out.fixed("BOX_BODY", [b.body for b in t.boxes])
+    with out.record("dof"):
+        for name in ("armature", "damping", "stiffness", "spring"):
+            out.scalars(f"dof_{name}", getattr(t, name))
+        out.scalars("dof_body", (owner.get(d, 0) for d in range(t.nv)), "int")
+    with out.record("motor"):
+        for name in ("gain", "low", "high"):
+            out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors))
+        out.scalars("motor_dof", (m.dof for m in t.motors), "int")
+    with out.record("box"):
         out.scalars("box_body", (b.body for b in t.boxes), "int")
         out.vectors("box_centre", (b.centre for b in t.boxes))
         out.vectors("box_size", (b.size for b in t.boxes))
         out.matrices("box_axes", (b.axes for b in t.boxes))
+    out.fixed("BOX_BODY", [b.body for b in t.boxes])
 
 
-def _round_bodies(out: _Writer, t: Tables) -> None:
-    """Inertias that are e E + k u u', if all are: fewer products turn them."""
-    across, along, axes = [], [], []
+def _chains(out: _Writer, t: Tables) -> None:
+    """Joints from the base to each body: twice the joint, and 1 where the body is its own."""
+    chains = [_chain(t, body) for body in range(len(t.bodies))]
+    links = [[2 * k + (t.joints[k].body == body) for k in chain] for body, chain in enumerate(chains)]
+    depth = max(map(len, links))
+    out.define(DEPTH=depth)
+    out.scalars("chain_link", (x[k] if k < len(x) else -1 for k in range(depth) for x in links), "int")
+
+
+def _inertias(out: _Writer, t: Tables) -> None:
+    """Inertias, as e E + k u u' if all are so: fewer products turn them."""
+    across, along, axes, even = [], [], [], True
     for body in t.bodies:
         values, vectors = np.linalg.eigh(body.inertia)
-        pair, single = ((0, 1), 2) if values[1] - values[0] < values[2] - values[1] else ((1, 2), 0)
-        across.append(values[list(pair)].mean())
+        pair, single = ([0, 1], 2) if values[1] - values[0] < values[2] - values[1] else ([1, 2], 0)
+        across.append(values[pair].mean())
         along.append(values[single] - across[-1])
         axes.append(vectors[:, single])
-        if np.ptp(values[list(pair)]) > 1e-9 * max(1e-12, values[2]):
-            out.define(ROUND_BODIES=0)
-            break
+        even = even and np.ptp(values[pair]) <= 1e-9 * max(1e-12, values[2])
+    out.define(ROUND_BODIES=even)
+    if even:
+        out.scalars("body_across", across)
+        out.scalars("body_along", along)
+        out.vectors("body_round_axis", axes)
     else:
-        out.define(ROUND_BODIES=1)
-    out.scalars("body_across", across)
-    out.scalars("body_along", along)
-    out.vectors("body_round_axis", axes)
+        out.symmetric("body_inertia", (b.inertia for b in t.bodies))
 
 
 def _chain(t: Tables, body: int) -> list[int]:
@@ -267,20 +305,28 @@ def _entries(out: _Writer, t: Tables) -> None:
     out.define(BASE_ENTRIES=len(block))
     out.scalars("base_entry", (i | j << 8 | k << 16 | minus << 24 for i, j, k, minus in block), "unsigned")
     entries = [(i, j) for i in range(t.nv) for j in (i, *t.ancestors[i])]
+    column = [len(above) for above in t.ancestors]  # in Jacobians of points
     out.define(ENTRIES=len(entries))
-    out.scalars("hessian_entry", (i | j << 8 for i, j in entries), "unsigned")
+    out.scalars("hessian_entry", (i | j << 8 | column[i] << 16 | column[j] << 24 for i, j in entries), "unsigned")
+    out.scalars("dof_column", column, "int")
     slots = [_slots(t, d) for d in range(t.nv)]
     out.scalars("dof_slots", slots, "unsigned")
     out.scalars("entry_slots", (slots[i] & slots[j] for i, j in entries), "unsigned")
+    if t.fills:
+        out.scalars("full_entry", (i | j << 8 for i in range(t.nv) for j in range(i + 1)), "unsigned")
     fills = [(i, j) for i in range(t.nv) for j in range(i) if j not in t.ancestors[i]]
     out.define(FILL_ENTRIES=len(fills))
     out.scalars("fill_entry", (i | j << 8 for i, j in fills), "unsigned")
 
 
+def _own_slots(t: Tables) -> bool:
+    """Whether each point that may touch has a slot of its own."""
+    return not t.pairs and len(t.points) <= min(MOST_SLOTS, t.most_contacts)
+
+
 def _slots(t: Tables, dof: int) -> int:
-    """The contacts that a dof moves, where each candidate has a slot."""
-    moved = [dof in t.bodies[p.body].chain for p in t.points] + [dof in t.pairs[k].dofs for k, _ in _touches(t)]
-    return _bits(np.flatnonzero(moved)) if len(moved) <= MOST_SLOTS else 0
+    """The contacts that a dof moves, where each point has a slot."""
+    return _bits(k for k, p in enumerate(t.points) if dof in t.bodies[p.body].chain) if _own_slots(t) else 0
 
 
 def _factor(out: _Writer, t: Tables, plan: Schedule) -> None:
@@ -297,6 +343,7 @@ def _factor(out: _Writer, t: Tables, plan: Schedule) -> None:
     out.define(TRUNK=trunk, ROUNDS=len(plan.rounds))
     out.fixed("ROUND_SIZE", sizes)
     out.fixed("ROUND_START", starts)
+    out.scalars("round_start", [*starts, len(entries)], "int")
     out.fixed("ROUND_BELOW", [max(b) for b in below])
     out.fixed("ROUND_EVEN", [min(b) == max(b) for b in below])
     out.scalars("round_entry", entries, "unsigned")
@@ -313,57 +360,58 @@ def _factor(out: _Writer, t: Tables, plan: Schedule) -> None:
     )
 
 
-def _touches(t: Tables) -> list[tuple[int, int]]:
-    """Pairs of segments and which of their contacts; two capsules that are parallel have two."""
-    both = [all(t.segments[s].half.any() for s in (p.first, p.second)) for p in t.pairs]
-    return [(k, which) for k, two in enumerate(both) for which in range(1 + two)]
-
-
 def _contacts(out: _Writer, t: Tables) -> None:
     """Candidates: points over the floor, then pairs."""
-    touches = _touches(t)
     # What rounding leaves of 0 (MuJoCo's is 1e-15 in f64): sine squared of parallel axes, m between segments that cross.
     out.line("constexpr real PARALLEL = sizeof(real) == 4 ? real(1e-10) : real(0);")
     out.line("constexpr real CROSSING = sizeof(real) == 4 ? real(1e-6) : real(1e-15);")
-    for name, kind in (("body", "int"), ("radius", "real"), ("height", "real")):
-        out.scalars(f"point_{name}", (getattr(p, name) for p in t.points), kind)
-    out.scalars("point_round", (not p.axis.any() for p in t.points), "bool")
-    out.vectors("point_centre", (p.centre for p in t.points))
-    out.vectors("point_axis", (p.axis for p in t.points))
-    out.scalars("segment_body", (s.body for s in t.segments), "int")
-    out.scalars("segment_radius", (s.radius for s in t.segments))
-    out.scalars("segment_length", (np.linalg.norm(s.half) for s in t.segments))
-    for name in ("centre", "half", "side"):
-        out.vectors(f"segment_{name}", (getattr(s, name) for s in t.segments))
-    out.scalars("pair_first", (t.pairs[k].first for k, _ in touches), "int")
-    out.scalars("pair_second", (t.pairs[k].second for k, _ in touches), "int")
-    out.scalars("pair_which", (which for _, which in touches), "int")
-    pairs = [t.pairs[k] for k, _ in touches]
-    contacts: list[Contact] = [p.contact for p in t.points] + [p.contact for p in pairs]
-    for name in ("friction", "margin", "regularisation"):
-        out.scalars(f"contact_{name}", (getattr(c, name) for c in contacts))
-    for name in ("stiffness", "damping", "lowest", "highest", "inverse_width"):
-        out.scalars(f"contact_{name}", (getattr(c.impedance, name) for c in contacts))
-    dofs = [_bits(t.bodies[p.body].chain) for p in t.points] + [_bits(p.dofs) for p in pairs]
-    out.scalars("contact_dofs", dofs, "unsigned")
-    minus = [_bits(d for d, sign in zip(p.dofs, p.signs, strict=True) if sign < 0) for p in pairs]
-    out.scalars("contact_opposite", [0] * len(t.points) + minus, "unsigned")
+    with out.record("point"):
+        out.vectors("point_centre", (p.centre for p in t.points))
+        out.scalars("point_radius", (p.radius for p in t.points))
+        out.vectors("point_axis", (p.axis for p in t.points))
+        out.scalars("point_height", (p.height for p in t.points))
+        out.scalars("point_body", (p.body for p in t.points), "int")
+        out.scalars("point_round", (not p.axis.any() for p in t.points), "bool")
+    with out.record("segment"):
+        out.vectors("segment_centre", (s.centre for s in t.segments))
+        out.scalars("segment_radius", (s.radius for s in t.segments))
+        out.vectors("segment_half", (s.half for s in t.segments))
+        out.scalars("segment_body", (s.body for s in t.segments), "int")
+        out.vectors("segment_side", (s.side for s in t.segments))
+    out.scalars("pair_segments", (p.first | p.second << 8 for p in t.pairs), "unsigned")
+    out.scalars("pair_far", (_far(t, p) for p in t.pairs))
+    contacts: list[Contact] = [p.contact for p in (*t.points, *t.pairs)]
     related = [{d, *t.ancestors[d]} for d in range(t.nv)]
-    fills = [any(a not in related[b] and b not in related[a] for a in p.dofs for b in p.dofs) for p in pairs]
-    out.scalars("contact_fills", [False] * len(t.points) + fills, "bool")
-    first = [-1] * len(t.points) + [t.segments[p.first].place for p in pairs]
-    second = [p.place for p in t.points] + [t.segments[p.second].place for p in pairs]
+    fills = [any(a not in related[b] and b not in related[a] for a in p.dofs for b in p.dofs) for p in t.pairs]
+    dofs = [_bits(t.bodies[p.body].chain) for p in t.points] + [_bits(p.dofs) for p in t.pairs]
+    minus = [_bits(d for d, sign in zip(p.dofs, p.signs, strict=True) if sign < 0) for p in t.pairs]
+    with out.record("contact"):
+        for name in ("friction", "margin", "regularisation"):
+            out.scalars(f"contact_{name}", (getattr(c, name) for c in contacts))
+        for name in Impedance._fields:
+            out.scalars(f"contact_{name}", (getattr(c.impedance, name) for c in contacts))
+        out.scalars("contact_dofs", dofs, "unsigned")
+        out.scalars("contact_opposite", [0] * len(t.points) + minus, "unsigned")
+        out.scalars("contact_fills", [False] * len(t.points) + fills, "bool")
+    first = [-1] * len(t.points) + [t.segments[p.first].place for p in t.pairs]
+    second = [p.place for p in t.points] + [t.segments[p.second].place for p in t.pairs]
     out.scalars("contact_first_place", first, "int")
     out.scalars("contact_second_place", second, "int")
 
 
+def _far(t: Tables, pair: Pair) -> float:
+    """m2, the square of the distance of two middles beyond which no contact is possible."""
+    both = [t.segments[k] for k in (pair.first, pair.second)]
+    return (sum(np.linalg.norm(s.half) + s.radius for s in both) + pair.contact.margin) ** 2 * 1.0001
+
+
 def _limits(out: _Writer, t: Tables) -> None:
-    out.scalars("limit_qpos", (x.qpos for x in t.limits), "int")
-    out.scalars("limit_dof", (x.dof for x in t.limits), "int")
-    for name in ("low", "high", "margin", "inverse_weight"):
-        out.scalars(f"limit_{name}", (getattr(x, name) for x in t.limits))
-    for name in ("stiffness", "damping", "lowest", "highest", "inverse_width"):
-        out.scalars(f"limit_{name}", (getattr(x.impedance, name) for x in t.limits))
+    with out.record("limit"):
+        for name in ("low", "high", "margin", "inverse_weight"):
+            out.scalars(f"limit_{name}", (getattr(x, name) for x in t.limits))
+        for name in Impedance._fields:
+            out.scalars(f"limit_{name}", (getattr(x.impedance, name) for x in t.limits))
+        out.scalars("limit_dof", (x.dof for x in t.limits), "int")
 
 
 def _readings(out: _Writer, t: Tables) -> None:

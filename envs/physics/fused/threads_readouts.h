@@ -18,7 +18,7 @@ DEVICE Vec world_point(const World& w, int body, Vec local) {
   Vec shift = {0, 0, 0};
   if (body > 0) {
     ROLLED for (int j = 0; j < JOINTS; ++j) {
-      if (joint_kind(j) == SHIFT) shift = shift + joint_axis(j) * (w.qpos[joint_qpos(j)] - joint_reference(j));
+      if (joint_kind(j) == SHIFT) shift = shift + joint_axis(j) * (w.qpos[BASE_QPOS + j] - joint_reference(j));
     }
   }
   return inside + shift;
@@ -53,11 +53,11 @@ DEVICE Quat world_quat(const World& w, int body, Quat own) {
     q = {w.qpos[3], vec_at(w.qpos + 4)};
 #endif
     ROLLED for (int level = 0; level < DEPTH; ++level) {
-      const int joint = chain_joint(level * BODIES + body);
+      const int joint = chain_link(level * BODIES + body) >> 1;
       if (joint < 0) continue;
       if (joint_kind(joint) == HINGE) {
         real s, c;
-        sine_cosine(real(0.5) * (w.qpos[joint_qpos(joint)] - joint_reference(joint)), &s, &c);
+        sine_cosine(real(0.5) * (w.qpos[BASE_QPOS + joint] - joint_reference(joint)), &s, &c);
         q = product(q, {c, joint_axis(joint) * s});
       }
       q = product(q, {joint_quat_w(joint), joint_quat_v(joint)});
@@ -109,11 +109,17 @@ DEVICE void put_wrench(World& w, int slot, const Contact& c) {
   const real edge[4] = {c.normal + c.first, c.normal - c.first, c.normal + c.second, c.normal - c.second};
   real f[4];
   UNROLLED for (int k = 0; k < 4; ++k) f[k] = edge[k] < 0 ? -c.weight * edge[k] : real(0);
-  const real* at = w.contact[slot];
-  const Vec point = vec_at(at), normal = vec_at(at + 3), first = vec_at(at + 6);
+  Touch touch;
+#if OWN_SLOTS
+  touches_floor(w, slot, touch);
+#else
+  const real* from = w.contact[slot];
+  touch = {vec_at(from), vec_at(from + 3), vec_at(from + 6), from[9]};
+#endif
+  const Vec normal = touch.normal, first = first_tangent(touch, c.candidate);
   const Vec force = normal * (f[0] + f[1] + f[2] + f[3]) + first * (f[0] - f[1]) + cross(normal, first) * (f[2] - f[3]);
-  put(w.J[slot], cross(point, force));
-  put(w.J[slot] + 3, force);
+  put(w.J + slot * J_WIDTH, cross(touch.point, force));
+  put(w.J + slot * J_WIDTH + 3, force);
 }
 
 DEVICE void put_contact_force(const World& w, int row, unsigned existing, real* to) {
@@ -122,11 +128,11 @@ DEVICE void put_contact_force(const World& w, int row, unsigned existing, real* 
   if (tree >= 0) {
     for (unsigned slots = existing; slots; slots &= slots - 1) {
       const int slot = lowest(slots);
-      const int candidate = OWN_SLOTS ? slot : w.candidate[slot];
+      const int candidate = candidate_of(w, slot);
       const real sign = real(contact_second_place(candidate) == row) - real(contact_first_place(candidate) == row);
       if (sign != 0) {
-        moment = moment + vec_at(w.J[slot]) * sign;
-        force = force + vec_at(w.J[slot] + 3) * sign;
+        moment = moment + vec_at(w.J + slot * J_WIDTH) * sign;
+        force = force + vec_at(w.J + slot * J_WIDTH + 3) * sign;
       }
     }
     moment = moment - cross(subtree_com(w, tree), force);
@@ -162,12 +168,7 @@ DEVICE void put_row(const World& w, int row, unsigned existing, real* to) {
   }
 }
 
-DEVICE void read_out(World& w, const PerLane<Contact>& contacts, unsigned existing, const Outputs& out) {
-  if constexpr (READS_FORCES) {
-    MEET();
-    EACH_LANE if (contacts[ME].exists) put_wrench(w, lane, contacts[ME]);
-    MEET();
-  }
+APART void read_rows(World& w, unsigned existing, const Outputs out) {
   repeat<0, READINGS>([&](auto number) {
     constexpr int reading = number;
     EACH_LANE {
@@ -177,4 +178,13 @@ DEVICE void read_out(World& w, const PerLane<Contact>& contacts, unsigned existi
       }
     }
   });
+}
+
+DEVICE void read_out(World& w, const PerLane<Contact>& contacts, unsigned existing, const Outputs& out) {
+  if constexpr (READS_FORCES) {
+    MEET();
+    EACH_LANE if (contacts[ME].exists) put_wrench(w, lane, contacts[ME]);
+    MEET();
+  }
+  read_rows(w, existing, out);
 }

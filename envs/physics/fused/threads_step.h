@@ -3,41 +3,86 @@
 #include "threads.h"
 #include MODEL
 
-constexpr int WIDTH = (NV + 1) | 1;  // of a row of H: its last column is the right side; odd, for shared memory's banks
-constexpr int PACKED = TRUNK * (TRUNK + 1) / 2 + TRUNK;  // the trunk's lower triangle, then its right side
-constexpr int COLUMNS = (3 * NV) | 1;  // of a contact's Jacobian: normal and two tangents of each dof
-constexpr int MOTION = 7;              // an angular and a linear part, and one to keep banks apart
-constexpr int FRAME = 13;
-constexpr int SUMS = 15;  // of what hangs on a body: first moment, inertia, force, moment
-constexpr int LINE_SEARCH_STEPS = 12;
+// Rows of shared memory that lanes read at a stride: whole fours that meet all banks, or an odd number of singles.
+constexpr int fours(int n) { return (n + 3) / 4 % 2 ? (n + 3) / 4 * 4 : (n + 3) / 4 * 4 + 4; }
 
-// Rows that agree with the floats of a world's shared memory.
-struct World {
-  alignas(16) real packed[PACKED + 4];
-  alignas(16) real qacc[NV];  // in MuJoCo's coordinates; the start of the next solve
+constexpr int WIDTH = (NV + 1) | 1;  // of a row of H: its last column is the right side
+constexpr int M_WIDTH = fours(NV);
+constexpr int PACKED = TRUNK * (TRUNK + 1) / 2 + TRUNK;  // the trunk's lower triangle, then its right side
+constexpr int J_WIDTH = fours(4 * COLUMNS);  // of a contact's Jacobian: normal, two tangents and a gap for each column
+constexpr int D_WIDTH = 12;
+constexpr int MOTION = 7;  // an angular and a linear part
+constexpr int FRAME = 13;
+constexpr int LINK = 17;   // a joint: rotation, anchor, axis, speed
+constexpr int SUMS = 15;   // of what hangs on a body: first moment, inertia, force, moment
+constexpr int LINE_SEARCH_STEPS = 12;
+#ifndef UNROLL_ROUNDS
+#define UNROLL_ROUNDS (ROUNDS <= 3)
+#endif
+#ifndef UNROLL_DEPTH
+#define UNROLL_DEPTH 3
+#endif
+constexpr int BASE_DOFS = FREE ? 6 : 0;   // joint j moves dof BASE_DOFS + j,
+constexpr int BASE_QPOS = FREE ? 7 : 0;   // and its qpos is BASE_QPOS + j
+
+// What the lanes of a world share.
+struct alignas(16) World {
+  union {  // kinematics, then forces, then the solver
+    real joint[JOINTS + 1][LINK];
+    real momentum[NV][MOTION];
+    struct {
+      alignas(16) real packed[PACKED + 4];
+      alignas(16) real step[(NV + 3) / 4 * 4];
+      real inverse[NV];  // of the pivots
+    };
+  };
+  alignas(16) real acceleration[(NV + 3) / 4 * 4];  // the solver's qacc, in the base's frame
+  alignas(16) real M[NV * M_WIDTH];
+  alignas(16) real J[SLOTS * J_WIDTH];
+  alignas(16) real D[SLOTS * D_WIDTH];  // a contact's weights nn n1 n2 11 22 and, from the ninth, its force n 1 2
+  real H[NV * WIDTH];                   // above its diagonal it holds the factor L, transposed
+  real qacc[NV];                        // in MuJoCo's coordinates; the start of the next solve
   real qpos[NQ], qvel[NV], actuator[NV];
   real start_qpos[NQ], start_qvel[NV], sum_velocity[NV], sum_acceleration[NV], rate[NV];
-  real velocity[NV], acceleration[NV];  // qvel and the solver's qacc in the base's frame
-  real smooth[NV];                      // forces without constraints
-  real inverse[NV];                     // of the pivots
-  real step[NV];
+  real velocity[NV];  // qvel in the base's frame
+  real smooth[NV];    // forces without constraints
   real limit_weight[NV], limit_force[NV];
   real base[9];
-  real joint[JOINTS + 1][FRAME];
   real pose[BODIES][FRAME];
   real sums[BODIES][SUMS];
-  real axis[NV][MOTION], momentum[NV][MOTION];
-  real M[NV * WIDTH], H[NV * WIDTH];  // above its diagonal H holds the factor L, transposed
-  real J[SLOTS][COLUMNS];
-  real D[SLOTS][9];  // a contact's weights nn n1 n2 11 22, and its force n 1 2
-  real contact[SLOTS][11];
-  int candidate[SLOTS];
-  unsigned touching[NV];  // contacts that a dof moves
+  real axis[NV][MOTION];
 #if FLUID
   real motion[BODIES][7];
   real drag[BOXES][7];
 #endif
+#if PAIRS > 0
+  real segment[SEGMENTS][7];  // middle, and half of the length
+  short near[PAIRS];          // pairs that may touch
+#endif
+#if !OWN_SLOTS
+  real contact[SLOTS][11];
+  int candidate[SLOTS];
+  unsigned touching[NV];  // contacts that a dof moves
+  unsigned moved[SLOTS];  // dofs that a contact moves with
+#endif
 };
+
+// Four numbers at once.
+#ifdef __CUDACC__
+typedef float4 Four;
+DEVICE Four four_at(const real* from) { return *reinterpret_cast<const float4*>(from); }
+DEVICE void put_four(real* to, real a, real b, real c) { *reinterpret_cast<float4*>(to) = make_float4(a, b, c, 0); }
+#else
+struct Four {
+  real x, y, z, w;
+};
+DEVICE Four four_at(const real* from) { return {from[0], from[1], from[2], from[3]}; }
+DEVICE void put_four(real* to, real a, real b, real c) {
+  to[0] = a;
+  to[1] = b;
+  to[2] = c;
+}
+#endif
 
 // A lane's contact: its four edges are normal +- first, normal +- second; the tangents' Jacobians are times friction.
 struct Contact {
@@ -81,7 +126,7 @@ DEVICE void place_joints(World& w) {
       w.acceleration[lane] = w.qacc[lane];
     }
     if (lane < JOINTS) {
-      const real at = w.qpos[joint_qpos(lane)] - joint_reference(lane);
+      const real at = w.qpos[BASE_QPOS + lane] - joint_reference(lane);
       const Vec axis = joint_axis(lane);
       const int kind = joint_kind(lane);
       Vec anchor = joint_anchor(lane);
@@ -89,8 +134,11 @@ DEVICE void place_joints(World& w) {
       if (kind == HINGE) R = rotation(axis, at);
       if (kind == SLIDE) anchor = anchor + axis * at;
       if constexpr (TURNED_JOINTS) R = mul(R, joint_rotation(lane));
-      put(w.joint[lane], R);
-      put(w.joint[lane] + 9, anchor);
+      real* to = w.joint[lane];
+      put(to, R);
+      put(to + 9, anchor);
+      put(to + 12, axis);
+      to[15] = w.qvel[BASE_DOFS + lane];
     }
   }
   MEET();
@@ -109,17 +157,17 @@ struct Walk {
 
 DEVICE void pass_joint(World& w, Walk& walk, int joint, bool own) {
   const real* at = w.joint[joint];
-  const int dof = joint_dof(joint);
-  const real speed = w.velocity[dof];
+  const real speed = at[15];
+  real* to = w.axis[BASE_DOFS + joint];
   walk.move(mul(walk.R, vec_at(at + 9)));
-  const Vec axis = mul(walk.R, joint_axis(joint));
+  const Vec axis = mul(walk.R, vec_at(at + 12));
   if (ALL_HINGES || joint_kind(joint) == HINGE) {
     walk.R = mul(walk.R, mat_at(at));
     walk.spin_rate = walk.spin_rate + cross(walk.spin, axis) * speed;
     walk.spin = walk.spin + axis * speed;
     if (own) {
-      put(w.axis[dof], axis);
-      put(w.axis[dof] + 3, cross(walk.p, axis));
+      put(to, axis);
+      put(to + 3, cross(walk.p, axis));
     }
     if constexpr (OFFSET_JOINTS) walk.move(mul(walk.R, joint_position(joint) * real(-1)));
   } else {
@@ -127,15 +175,18 @@ DEVICE void pass_joint(World& w, Walk& walk, int joint, bool own) {
     if constexpr (FLUID) walk.velocity = walk.velocity + axis * speed;
     if constexpr (TURNED_JOINTS) walk.R = mul(walk.R, mat_at(at));
     if (own) {
-      put(w.axis[dof], vec(0, 0, 0));
-      put(w.axis[dof] + 3, axis);
+      put(to, vec(0, 0, 0));
+      put(to + 3, axis);
     }
   }
 }
 
 DEVICE Sym body_inertia_in(const Mat& R, int body) {
-  if constexpr (ROUND_BODIES) return outer(body_across(body), body_along(body), mul(R, body_round_axis(body)));
+#if ROUND_BODIES
+  return outer(body_across(body), body_along(body), mul(R, body_round_axis(body)));
+#else
   return turned(R, body_inertia(body));
+#endif
 }
 
 // A lane a body: its place, and the force and inertia about the base's origin (Newton and Euler).
@@ -147,9 +198,14 @@ DEVICE void place_bodies(World& w) {
     walk.rate = vec_at(w.base + 6) * GRAVITY;
     walk.velocity = vec_at(w.velocity);
 #endif
-    ROLLED for (int level = 0; level < DEPTH; ++level) {
-      const int joint = chain_joint(level * BODIES + lane);
-      if (joint >= 0) pass_joint(w, walk, joint, joint_body(joint) == lane);
+    const auto pass = [&](int level) {
+      const int link = chain_link(level * BODIES + lane);
+      if (link >= 0) pass_joint(w, walk, link >> 1, link & 1);
+    };
+    if constexpr (DEPTH <= UNROLL_DEPTH) {
+      UNROLLED for (int level = 0; level < DEPTH; ++level) pass(level);
+    } else {
+      ROLLED for (int level = 0; level < DEPTH; ++level) pass(level);
     }
     put(w.pose[lane], walk.R);
     put(w.pose[lane] + 9, walk.p);
@@ -227,7 +283,7 @@ DEVICE void sum_subtrees(World& w) {
 DEVICE void find_forces(World& w) {
   EACH_LANE if (lane < NV) {
     real force = w.actuator[lane] - dof_damping(lane) * w.velocity[lane];
-    if constexpr (SPRINGS) force -= dof_stiffness(lane) * (w.qpos[dof_qpos(lane)] - dof_spring(lane));
+    if (SPRINGS && lane >= BASE_DOFS) force -= dof_stiffness(lane) * (w.qpos[lane - BASE_DOFS + BASE_QPOS] - dof_spring(lane));
     if (FREE && lane < 6) {
       w.smooth[lane] = force - w.sums[0][9 + lane];
     } else {
@@ -243,8 +299,8 @@ DEVICE void find_forces(World& w) {
       if constexpr (FREE) {
         const real row[6] = {push.x, push.y, push.z, turn.x, turn.y, turn.z};
         UNROLLED for (int k = 0; k < 6; ++k) {
-          w.M[lane * WIDTH + k] = row[k];
-          w.M[k * WIDTH + lane] = row[k];
+          w.M[lane * M_WIDTH + k] = row[k];
+          w.M[k * M_WIDTH + lane] = row[k];
         }
       }
     }
@@ -263,16 +319,16 @@ DEVICE void find_inertia(World& w) {
       const real* b = w.momentum[i];
       real y = i == j ? dof_armature(i) : real(0);
       UNROLLED for (int k = 0; k < 6; ++k) y += a[k] * b[k];
-      w.M[i * WIDTH + j] = y;
-      w.M[j * WIDTH + i] = y;
+      w.M[i * M_WIDTH + j] = y;
+      w.M[j * M_WIDTH + i] = y;
     }
     if (FREE && lane < BASE_ENTRIES) {
       const unsigned entry = base_entry(lane);  // i, j, which of the sums, whether its sign changes
       const int i = entry & 255, j = entry >> 8 & 255;
       const real x = w.sums[0][entry >> 16 & 255];
       const real y = (entry >> 24 ? -x : x) + (i == j ? dof_armature(i) : real(0));
-      w.M[i * WIDTH + j] = y;
-      w.M[j * WIDTH + i] = y;
+      w.M[i * M_WIDTH + j] = y;
+      w.M[j * M_WIDTH + i] = y;
     }
   }
 }
@@ -280,11 +336,13 @@ DEVICE void find_inertia(World& w) {
 // What is the same in all evaluations of a step, and what is never written.
 DEVICE void clear(World& w) {
   EACH_LANE {
-    for (int k = lane; k < NV * WIDTH; k += LANES) w.M[k] = w.H[k] = 0;
+    ROLLED for (int k = lane; k < NV * M_WIDTH; k += LANES) w.M[k] = 0;
+    ROLLED for (int k = lane; k < NV * WIDTH; k += LANES) w.H[k] = 0;
+    if (lane < 4) w.acceleration[(NV + 3) / 4 * 4 - 4 + lane] = 0;
   }
   MEET();
 #if FREE
-  EACH_LANE if (lane < 3) w.M[lane * WIDTH + lane] = body_subtree_mass(0) + dof_armature(lane);
+  EACH_LANE if (lane < 3) w.M[lane * M_WIDTH + lane] = body_subtree_mass(0) + dof_armature(lane);
   MEET();
 #endif
 }
@@ -381,26 +439,55 @@ DEVICE Nearest nearest_of(Vec a, Vec half_a, Vec b, Vec half_b, real reach, int 
   return found;
 }
 
+// A lane a segment: where it is.
+DEVICE void place_segments(World& w) {
+  EACH_LANE {
+    for (int k = lane; k < SEGMENTS; k += LANES) {
+      const real* pose = w.pose[segment_body(k)];
+      const Mat R = mat_at(pose);
+      put(w.segment[k], mul(R, segment_centre(k)) + vec_at(pose + 9));
+      put(w.segment[k] + 3, mul(R, segment_half(k)));
+    }
+  }
+  MEET();
+}
+
+// Lists the pairs whose bounding spheres touch, and returns how many.
+DEVICE int list_near(World& w) {
+  int found = 0;
+  ROLLED for (int start = 0; start < PAIRS; start += LANES) {
+    PerLane<bool> near;
+    EACH_LANE {
+      const int pair = start + lane;
+      near[ME] = false;
+      if (pair < PAIRS) {
+        const unsigned segments = pair_segments(pair);
+        const Vec between = vec_at(w.segment[segments & 255]) - vec_at(w.segment[segments >> 8]);
+        near[ME] = dot(between, between) <= pair_far(pair);
+      }
+    }
+    const unsigned hits = ballot(near);
+    EACH_LANE if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
+    found += count(hits);
+  }
+  MEET();
+  return found;
+}
+
 // mjraw_SphereSphere at the nearest places. Segments that cross have no normal: MuJoCo takes a product of two axes.
-DEVICE bool touches_pair(const World& w, int pair, Touch& touch) {
-  const real* pose_a = w.pose[segment_body(pair_first(pair))];
-  const real* pose_b = w.pose[segment_body(pair_second(pair))];
-  const int first = pair_first(pair), second = pair_second(pair);
-  const Mat Ra = mat_at(pose_a), Rb = mat_at(pose_b);
-  const Vec a = mul(Ra, segment_centre(first)) + vec_at(pose_a + 9);
-  const Vec b = mul(Rb, segment_centre(second)) + vec_at(pose_b + 9), between = a - b;
-  const real margin = contact_margin(POINTS + pair);
-  const real radii = segment_radius(first) + segment_radius(second), reach = radii + margin;
-  const real far = reach + segment_length(first) + segment_length(second);
-  if (!(dot(between, between) <= far * far * real(1.0001))) return false;
-  const Nearest found = nearest_of(a, mul(Ra, segment_half(first)), b, mul(Rb, segment_half(second)), reach,
-                                   pair_which(pair));
+DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
+  const unsigned segments = pair_segments(pair);
+  const int first = segments & 255, second = segments >> 8;
+  const real radii = segment_radius(first) + segment_radius(second), reach = radii + contact_margin(POINTS + pair);
+  const Nearest found = nearest_of(vec_at(w.segment[first]), vec_at(w.segment[first] + 3), vec_at(w.segment[second]),
+                                   vec_at(w.segment[second] + 3), reach, which);
   if (!found.touches) return false;
   const Vec gap = found.to - found.from;
   const real length = root(dot(gap, gap));
   Vec normal = gap * (real(1) / length);
   if (length < CROSSING) {
-    normal = cross(mul(Ra, segment_side(first)), mul(Rb, segment_side(second)));
+    normal = cross(mul(mat_at(w.pose[segment_body(first)]), segment_side(first)),
+                   mul(mat_at(w.pose[segment_body(second)]), segment_side(second)));
     const real size = root(dot(normal, normal));
     normal = size < real(1e-15) ? vec(1, 0, 0) : normal * (real(1) / size);
   }
@@ -413,28 +500,19 @@ DEVICE bool touches_pair(const World& w, int pair, Touch& touch) {
 }
 #endif
 
-DEVICE bool touches(const World& w, int candidate, Touch& touch) {
-#if PAIRS > 0
-  if (candidate >= POINTS) return touches_pair(w, candidate - POINTS, touch);
-#endif
-  return touches_floor(w, candidate, touch);
-}
-
-// Slots of a fixed number: a candidate's own lane, or the next that is free. Returns how many contacts there are.
+// Contacts in slots: a point's own lane, or the next that is free. Returns how many there are.
 DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>& touch) {
 #if OWN_SLOTS
   PerLane<bool> hit;
   EACH_LANE {
-    hit[ME] = lane < CANDIDATES && touches(w, lane, touch[ME]);
+    hit[ME] = lane < POINTS && touches_floor(w, lane, touch[ME]);
     contacts[ME].exists = hit[ME];
     contacts[ME].candidate = lane;
   }
   return count(ballot(hit));
 #else
   int found = 0;
-  ROLLED for (int start = 0; start < CANDIDATES; start += LANES) {
-    PerLane<bool> hit;
-    EACH_LANE hit[ME] = start + lane < CANDIDATES && touches(w, start + lane, touch[ME]);
+  const auto take = [&](const PerLane<bool>& hit, const PerLane<int>& candidate) {
     const unsigned hits = ballot(hit);
     EACH_LANE {
       const int slot = found + count(hits & ((1u << lane) - 1u));
@@ -444,11 +522,32 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
         put(to + 3, touch[ME].normal);
         put(to + 6, touch[ME].tangent);
         to[9] = touch[ME].distance;
-        w.candidate[slot] = start + lane;
+        w.candidate[slot] = candidate[ME];
       }
     }
     found += count(hits);
+  };
+  PerLane<bool> hit;
+  PerLane<int> candidate;
+  ROLLED for (int start = 0; start < POINTS; start += LANES) {
+    EACH_LANE {
+      candidate[ME] = start + lane;
+      hit[ME] = start + lane < POINTS && touches_floor(w, start + lane, touch[ME]);
+    }
+    take(hit, candidate);
   }
+#if PAIRS > 0
+  place_segments(w);
+  const int near = list_near(w);  // parallel capsules touch twice
+  ROLLED for (int start = 0; start < 2 * near; start += LANES) {
+    EACH_LANE {
+      const int item = start + lane, pair = item < 2 * near ? w.near[item >> 1] : 0;
+      candidate[ME] = POINTS + pair;
+      hit[ME] = item < 2 * near && touches_pair(w, pair, item & 1, touch[ME]);
+    }
+    take(hit, candidate);
+  }
+#endif
   MEET();
   EACH_LANE {
     contacts[ME].exists = lane < found && lane < SLOTS;
@@ -468,17 +567,16 @@ struct Directions {
   Vec normal_turn, first_turn, second_turn;  // their moments about the base's origin
 };
 
-DEVICE void put_column(World& w, int slot, int dof, const real (&row)[3], real rate, Contact& contact) {
-  real* to = w.J[slot] + 3 * dof;
-  to[0] = row[0];
-  to[1] = row[1];
-  to[2] = row[2];
+DEVICE void put_column(World& w, int slot, int column, const real (&row)[3], real rate, Contact& contact) {
+  put_four(w.J + slot * J_WIDTH + 4 * column, row[0], row[1], row[2]);
   contact.normal += row[0] * rate;
   contact.first += row[1] * rate;
   contact.second += row[2] * rate;
 }
 
+// The columns of the dofs that move the contact, in their order.
 DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, Contact& contact) {
+  int column = 0;
 #if FREE
   if (contact.dofs & 1u) {
     const Vec n[2] = {d.normal, d.normal_turn}, t[2] = {d.first, d.first_turn}, u[2] = {d.second, d.second_turn};
@@ -489,6 +587,7 @@ DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, C
                            axis == 0 ? c.x : axis == 1 ? c.y : c.z};
       put_column(w, slot, k, row, w.acceleration[k] + damping * w.velocity[k], contact);
     }
+    column = 6;
   }
 #endif
 #if PAIRS > 0
@@ -505,12 +604,27 @@ DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, C
       UNROLLED for (int k = 0; k < 3; ++k) row[k] = -row[k];
     }
 #endif
-    put_column(w, slot, dof, row, w.acceleration[dof] + damping * w.velocity[dof], contact);
+    put_column(w, slot, column++, row, w.acceleration[dof] + damping * w.velocity[dof], contact);
   }
 }
 
+// The column of a dof in a contact's Jacobian.
+DEVICE int column_of(const World& w, int slot, int dof) {
+#if OWN_SLOTS
+  return dof_column(dof);
+#else
+  return count(w.moved[slot] & ((1u << dof) - 1u));
+#endif
+}
+
+// The first tangent times friction (mju_makeFrame).
+DEVICE Vec first_tangent(const Touch& touch, int candidate) {
+  const Vec t = touch.tangent - touch.normal * dot(touch.normal, touch.tangent);
+  return t * (contact_friction(candidate) * inverse_root(dot(t, t) + real(1e-30)));
+}
+
 // Jacobians, weights (mj_makeImpedance) and residuals J a - aref of contacts and limits at the solver's start.
-DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limit>& limits, bool last, bool& lost) {
+DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limit>& limits, bool& lost) {
   PerLane<Touch> touch;
   PerLane<bool> exists;
   const int found = collect_contacts(w, contacts, touch);
@@ -524,9 +638,7 @@ DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<L
     if (contact.exists) {
       const int c = contact.candidate;
       const Vec n = touch[ME].normal, r = touch[ME].point;
-      Vec t = touch[ME].tangent - n * dot(n, touch[ME].tangent);
-      t = t * inverse_root(dot(t, t) + real(1e-30));
-      const Vec first = t * contact_friction(c), second = cross(n, first);
+      const Vec first = first_tangent(touch[ME], c), second = cross(n, first);
       const Directions directions = {n, first, second, cross(r, n), cross(r, first), cross(r, second)};
       contact.dofs = contact_dofs(c);
       put_columns(w, lane, directions, contact_damping(c), contact);
@@ -534,18 +646,16 @@ DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<L
       const real impedance = impedance_at(violation, contact_lowest(c), contact_highest(c), contact_inverse_width(c));
       contact.weight = impedance * reciprocal(contact_regularisation(c) * (real(1) - impedance));
       contact.normal += contact_stiffness(c) * impedance * violation;
-      if (last) {
-        put(w.contact[lane], r);
-        put(w.contact[lane] + 3, n);
-        put(w.contact[lane] + 6, first);
-      }
+#if !OWN_SLOTS
+      w.moved[lane] = contact.dofs;
+#endif
     }
     Limit& limit = limits[ME];
     limit.weight = limit.residual = limit.sign = limit.change = 0;
 #if LIMITS > 0
     if (lane < LIMITS) {
       const int dof = limit_dof(lane);
-      const real q = w.qpos[limit_qpos(lane)], low = q - limit_low(lane), high = limit_high(lane) - q;
+      const real q = w.qpos[dof - BASE_DOFS + BASE_QPOS], low = q - limit_low(lane), high = limit_high(lane) - q;
       const real violation = (low < high ? low : high) - limit_margin(lane);
       if (violation < 0) {
         const real impedance =
@@ -576,34 +686,57 @@ DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<L
 // M x of a lane's dof.
 DEVICE real times_inertia(const World& w, const real* x, int dof) {
   real y = 0;
-  UNROLLED for (int j = 0; j < NV; ++j) y += w.M[dof * WIDTH + j] * x[j];
+  UNROLLED for (int j = 0; j < NV; j += 4) {
+    const Four a = four_at(w.M + dof * M_WIDTH + j), b = four_at(x + j);
+    y += a.x * b.x;
+    if (j + 1 < NV) y += a.y * b.y;
+    if (j + 2 < NV) y += a.z * b.z;
+    if (j + 3 < NV) y += a.w * b.w;
+  }
   return y;
 }
 
-// Branches, from the leaves: each entry once, H[i][j] -= sum over k below i of H[k][i] H[k][j] / pivot k.
+// An entry of a branch's dof i: H[i][j] -= sum over k below i of H[k][i] H[k][j] / pivot k.
+DEVICE void eliminate_entry(World& w, unsigned entry, int below, bool first_round) {
+  const int i = entry & 255, j = entry >> 8 & 255;
+  real pivot = w.H[i * WIDTH + i], value = w.H[i * WIDTH + j];
+  const real* upper = w.H + i * WIDTH + i;
+  const real* lower = w.H + i * WIDTH;
+  for (int t = 1; t <= below; ++t) {
+    lower += WIDTH;
+    pivot -= upper[t] * lower[i];
+    value -= upper[t] * lower[j];
+  }
+  const real inverse = reciprocal(pivot);
+  if (entry >> 16) w.inverse[i] = inverse;
+  if (!first_round) w.H[i * WIDTH + j] = value;
+  if (j < NV) w.H[j * WIDTH + i] = value * inverse;
+}
+
+// Branches, from the leaves: each entry once.
 DEVICE void eliminate_branches(World& w) {
+#if UNROLL_ROUNDS
   repeat<0, ROUNDS>([&](auto turn) {
     constexpr int round = turn;
     EACH_LANE {
       UNROLLED for (int e = lane; e < ROUND_SIZE[round]; e += LANES) {
         const unsigned entry = round_entry(ROUND_START[round] + e);
-        const int i = entry & 255, j = entry >> 8 & 255;
-        real pivot = w.H[i * WIDTH + i], value = w.H[i * WIDTH + j];
-        UNROLLED for (int t = 1; t <= ROUND_BELOW[round]; ++t) {
-          if (ROUND_EVEN[round] || t <= dof_below(i)) {
-            const real l = w.H[i * WIDTH + i + t];
-            pivot -= l * w.H[(i + t) * WIDTH + i];
-            value -= l * w.H[(i + t) * WIDTH + j];
-          }
-        }
-        const real inverse = reciprocal(pivot);
-        if (entry >> 16) w.inverse[i] = inverse;
-        if (round > 0) w.H[i * WIDTH + j] = value;
-        if (j < NV) w.H[j * WIDTH + i] = value * inverse;
+        eliminate_entry(w, entry, ROUND_EVEN[round] ? ROUND_BELOW[round] : dof_below(entry & 255), round == 0);
       }
     }
     MEET();
   });
+#else
+  ROLLED for (int round = 0; round < ROUNDS; ++round) {
+    EACH_LANE {
+      ROLLED for (int e = round_start(round) + lane; e < round_start(round + 1); e += LANES) {
+        const unsigned entry = round_entry(e);
+        eliminate_entry(w, entry, dof_below(entry & 255), false);
+      }
+    }
+    MEET();
+  }
+#endif
 }
 
 // What branches leave of the trunk's triangle and right side.
@@ -621,17 +754,13 @@ DEVICE void pack_trunk(World& w) {
 }
 
 DEVICE void load_packed(const World& w, real (&to)[PACKED + 4]) {
-#ifdef __CUDACC__
   UNROLLED for (int k = 0; k < PACKED; k += 4) {
-    const float4 four = *reinterpret_cast<const float4*>(w.packed + k);
+    const Four four = four_at(w.packed + k);
     to[k] = four.x;
     to[k + 1] = four.y;
     to[k + 2] = four.z;
     to[k + 3] = four.w;
   }
-#else
-  for (int k = 0; k < PACKED; ++k) to[k] = w.packed[k];
-#endif
 }
 
 // All of the trunk by L D L', in every lane the same.
@@ -682,58 +811,32 @@ DEVICE void solve_tree(World& w, PerLane<real>& x) {
 }
 
 #if FILLS
-// The same for a full H: Cholesky, a row a lane. Leaves H's pattern to be cleared.
+// The same where a contact between two branches fills H: L D L' from the last dof. H's pattern is clear again behind it.
 DEVICE void solve_full(World& w, PerLane<real>& x) {
-#ifdef __CUDACC__
-  const int lane = int(threadIdx.x);
-  const unsigned all = 0xffffffffu;
-  real h[NV];
-  UNROLLED for (int j = 0; j < NV; ++j) h[j] = lane < NV && j <= lane ? w.H[lane * WIDTH + j] : real(0);
-  real y = lane < NV ? w.H[lane * WIDTH + NV] : real(0), inverse = 0;
-  UNROLLED for (int j = 0; j < NV; ++j) {
-    const real scale = inverse_root(__shfl_sync(all, h[j], j));
-    const real l = h[j] * scale;
-    h[j] = l;
-    if (lane == j) inverse = scale;
-    UNROLLED for (int k = j + 1; k < NV; ++k) h[k] -= l * __shfl_sync(all, l, k);
-    const real yj = __shfl_sync(all, y, j) * scale;
-    y = lane == j ? yj : lane > j ? y - l * yj : y;
-  }
-  MEET();
-  if (lane < NV) {
-    UNROLLED for (int j = 0; j < NV; ++j) {
-      if (j <= lane) w.H[lane * WIDTH + j] = h[j];
+  ROLLED for (int k = NV - 1; k >= 0; --k) {
+    const real inverse = reciprocal(w.H[k * WIDTH + k]);
+    const real* row = w.H + k * WIDTH;
+    EACH_LANE {
+      ROLLED for (int e = lane; e < k * (k + 1) / 2; e += LANES) {
+        const unsigned entry = full_entry(e);
+        const int i = entry & 255, j = entry >> 8;
+        w.H[i * WIDTH + j] -= row[i] * inverse * row[j];
+      }
+      if (lane < k) w.H[lane * WIDTH + NV] -= row[lane] * inverse * row[NV];
+      if (lane == k) w.inverse[k] = inverse;
     }
+    MEET();
   }
-  MEET();
-  UNROLLED for (int j = NV - 1; j >= 0; --j) {
-    const real xj = __shfl_sync(all, y * inverse, j);
-    y = lane == j ? xj : lane < j ? y - w.H[j * WIDTH + lane] * xj : y;
+  EACH_LANE x[ME] = lane < NV ? w.H[lane * WIDTH + NV] * w.inverse[lane] : real(0);
+  ROLLED for (int k = 0; k < NV - 1; ++k) {
+    PerLane<int> source;
+    EACH_LANE source[ME] = k;
+    const PerLane<real> above = gathered(x, source);
+    EACH_LANE if (lane > k && lane < NV) x[ME] -= w.H[lane * WIDTH + k] * w.inverse[lane] * above[ME];
   }
-  x[0] = lane < NV ? y : real(0);
-#else
-  real* H = w.H;
-  for (int j = 0; j < NV; ++j)
-    for (int i = j; i < NV; ++i) {
-      real y = H[i * WIDTH + j];
-      for (int k = 0; k < j; ++k) y -= H[i * WIDTH + k] * H[j * WIDTH + k];
-      H[i * WIDTH + j] = i == j ? real(sqrt(y)) : y / H[j * WIDTH + j];
-    }
-  for (int i = 0; i < NV; ++i) {
-    real y = H[i * WIDTH + NV];
-    for (int k = 0; k < i; ++k) y -= H[i * WIDTH + k] * x[k];
-    x[i] = y / H[i * WIDTH + i];
-  }
-  for (int i = NV - 1; i >= 0; --i) {
-    real y = x[i];
-    for (int k = i + 1; k < NV; ++k) y -= H[k * WIDTH + i] * x[k];
-    x[i] = y / H[i * WIDTH + i];
-  }
-  for (int i = NV; i < LANES; ++i) x[i] = 0;
-#endif
   MEET();
   EACH_LANE {
-    for (int e = lane; e < FILL_ENTRIES; e += LANES) {
+    ROLLED for (int e = lane; e < FILL_ENTRIES; e += LANES) {
       const unsigned entry = fill_entry(e);
       w.H[(entry & 255) * WIDTH + (entry >> 8)] = 0;
     }
@@ -757,15 +860,10 @@ DEVICE unsigned find_active(World& w, PerLane<Contact>& contacts, PerLane<Limit>
         f[k] = -d[k] * edge[k];
       }
       if (bits) {
-        real* to = w.D[lane];
-        to[0] = d[0] + d[1] + d[2] + d[3];
-        to[1] = d[0] - d[1];
-        to[2] = d[2] - d[3];
-        to[3] = d[0] + d[1];
-        to[4] = d[2] + d[3];
-        to[5] = f[0] + f[1] + f[2] + f[3];
-        to[6] = f[0] - f[1];
-        to[7] = f[2] - f[3];
+        real* to = w.D + lane * D_WIDTH;
+        put_four(to, d[0] + d[1] + d[2] + d[3], d[0] - d[1], d[2] - d[3]);
+        put_four(to + 4, d[0] + d[1], d[2] + d[3], 0);
+        put_four(to + 8, f[0] + f[1] + f[2] + f[3], f[0] - f[1], f[2] - f[3]);
       }
     }
     pushes[ME] = bits != 0;
@@ -786,18 +884,33 @@ DEVICE unsigned find_active(World& w, PerLane<Contact>& contacts, PerLane<Limit>
   return pushing;
 }
 
-DEVICE unsigned touching(const World& w, int dof) { return OWN_SLOTS ? dof_slots(dof) : w.touching[dof]; }
+// The contacts that move with a dof.
+DEVICE unsigned touching(const World& w, int dof) {
+#if OWN_SLOTS
+  return dof_slots(dof);
+#else
+  return w.touching[dof];
+#endif
+}
 
-// J' D J of an entry, over the contacts that push and move with both dofs.
-DEVICE real contact_entry(const World& w, int i, int j, unsigned slots) {
+DEVICE int candidate_of(const World& w, int slot) {
+#if OWN_SLOTS
+  return slot;
+#else
+  return w.candidate[slot];
+#endif
+}
+
+// J' D J of an entry, over the contacts that push and move with both dofs. Columns: of slots that are a point's own.
+DEVICE real contact_entry(const World& w, int i, int j, int column_i, int column_j, unsigned slots) {
   real y = 0;
   for (; slots; slots &= slots - 1) {
     const int slot = lowest(slots);
-    const real* a = w.J[slot] + 3 * i;
-    const real* b = w.J[slot] + 3 * j;
-    const real* D = w.D[slot];
-    y += a[0] * (D[0] * b[0] + D[1] * b[1] + D[2] * b[2]) + a[1] * (D[1] * b[0] + D[3] * b[1]) +
-         a[2] * (D[2] * b[0] + D[4] * b[2]);
+    const real* J = w.J + slot * J_WIDTH;
+    const Four a = four_at(J + 4 * (OWN_SLOTS ? column_i : column_of(w, slot, i)));
+    const Four b = four_at(J + 4 * (OWN_SLOTS ? column_j : column_of(w, slot, j)));
+    const Four n = four_at(w.D + slot * D_WIDTH), t = four_at(w.D + slot * D_WIDTH + 4);
+    y += a.x * (n.x * b.x + n.y * b.y + n.z * b.z) + a.y * (n.y * b.x + t.x * b.y) + a.z * (n.z * b.x + t.y * b.z);
   }
   return y;
 }
@@ -810,9 +923,9 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
       real y = excess[ME] - w.limit_force[lane];
       for (unsigned slots = pushing & touching(w, lane); slots; slots &= slots - 1) {
         const int slot = lowest(slots);
-        const real* J = w.J[slot] + 3 * lane;
-        const real* f = w.D[slot] + 5;
-        y -= J[0] * f[0] + J[1] * f[1] + J[2] * f[2];
+        const Four J = four_at(w.J + slot * J_WIDTH + 4 * column_of(w, slot, lane));
+        const Four f = four_at(w.D + slot * D_WIDTH + 8);
+        y -= J.x * f.x + J.y * f.y + J.z * f.z;
       }
       gradient[ME] = y;
       w.H[lane * WIDTH + NV] = y;
@@ -820,8 +933,11 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
     UNROLLED for (int e = lane; e < ENTRIES; e += LANES) {
       const unsigned entry = hessian_entry(e);
       const int i = entry & 255, j = entry >> 8 & 255;
-      real y = w.M[i * WIDTH + j];
-      y += contact_entry(w, i, j, pushing & (OWN_SLOTS ? entry_slots(e) : touching(w, i) & touching(w, j)));
+      real y = w.M[i * M_WIDTH + j];
+      if (pushing) {
+        const unsigned slots = pushing & (OWN_SLOTS ? entry_slots(e) : touching(w, i) & touching(w, j));
+        y += contact_entry(w, i, j, entry >> 16 & 255, entry >> 24, slots);
+      }
       if (i == j) y += w.limit_weight[i];
       w.H[i * WIDTH + j] = y;
     }
@@ -830,7 +946,7 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
       ROLLED for (int e = lane; e < FILL_ENTRIES; e += LANES) {
         const unsigned entry = fill_entry(e);
         const int i = entry & 255, j = entry >> 8 & 255;
-        w.H[i * WIDTH + j] = contact_entry(w, i, j, pushing & touching(w, i) & touching(w, j));
+        w.H[i * WIDTH + j] = contact_entry(w, i, j, 0, 0, pushing & touching(w, i) & touching(w, j));
       }
     }
 #endif
@@ -846,13 +962,21 @@ DEVICE bool find_changes(World& w, PerLane<Contact>& contacts, PerLane<Limit>& l
     unsigned bits = 0;
     if (c.exists) {
       real n = 0, t = 0, u = 0;
-      for (unsigned dofs = c.dofs; dofs; dofs &= dofs - 1) {
-        const int dof = lowest(dofs);
-        const real* J = w.J[lane] + 3 * dof;
-        n += J[0] * w.step[dof];
-        t += J[1] * w.step[dof];
-        u += J[2] * w.step[dof];
+      const real* J = w.J + lane * J_WIDTH;
+      const auto add = [&](int dof) {
+        const Four column = four_at(J);
+        const real step = w.step[dof];
+        n += column.x * step;
+        t += column.y * step;
+        u += column.z * step;
+        J += 4;
+      };
+#if FREE
+      if (c.dofs & 1u) {
+        UNROLLED for (int k = 0; k < 6; ++k) add(k);
       }
+#endif
+      for (unsigned dofs = c.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) add(lowest(dofs));
       c.d_normal = n;
       c.d_first = t;
       c.d_second = u;
@@ -926,16 +1050,16 @@ DEVICE void solve_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limi
     else
 #endif
       solve_tree(w, x);
-    PerLane<real> falls;
-    EACH_LANE {
-      if (lane < NV) w.step[lane] = -x[ME];
-      falls[ME] = -x[ME] * gradient[ME];
-    }
-    const real slope = sum(falls);
+    EACH_LANE if (lane < NV) w.step[lane] = -x[ME];
     MEET();
-    const bool differs = find_changes(w, contacts, limits, active);
-    done = !(differs && -slope * IMPROVEMENT_SCALE > real(1e-9));  // also of what is not a number
-    real length = 1;
+    done = !find_changes(w, contacts, limits, active);
+    real length = 1, slope = 0;
+    if (!done) {
+      PerLane<real> falls;
+      EACH_LANE falls[ME] = -x[ME] * gradient[ME];
+      slope = sum(falls);
+      done = !(-slope * IMPROVEMENT_SCALE > real(1e-9));  // also of what is not a number
+    }
     if (!done) {
       PerLane<real> change, one, two;
       EACH_LANE {
@@ -969,7 +1093,7 @@ DEVICE void evaluate(World& w, bool last, const Outputs& out, bool& lost) {
   sum_subtrees(w);
   find_forces(w);
   find_inertia(w);
-  const unsigned existing = find_constraints(w, contacts, limits, last, lost);
+  const unsigned existing = find_constraints(w, contacts, limits, lost);
   bool full = false;
 #if FILLS
   PerLane<bool> couples;
@@ -992,7 +1116,8 @@ DEVICE void evaluate(World& w, bool last, const Outputs& out, bool& lost) {
 // qpos = start_qpos advanced by a time step of `rate` (mj_integratePos).
 DEVICE void advance(World& w) {
   EACH_LANE {
-    if (lane < JOINTS) w.qpos[joint_qpos(lane)] = w.start_qpos[joint_qpos(lane)] + TIMESTEP * w.rate[joint_dof(lane)];
+    if (lane < JOINTS)
+      w.qpos[BASE_QPOS + lane] = w.start_qpos[BASE_QPOS + lane] + TIMESTEP * w.rate[BASE_DOFS + lane];
 #if FREE
     if (lane >= LANES - 3) {
       const int k = lane - (LANES - 3);
@@ -1060,7 +1185,7 @@ DEVICE void damp(World& w, PerLane<real>& x) {
     UNROLLED for (int e = lane; e < ENTRIES; e += LANES) {
       const unsigned entry = hessian_entry(e);
       const int i = entry & 255, j = entry >> 8 & 255;
-      w.H[i * WIDTH + j] = w.M[i * WIDTH + j] + (i == j ? TIMESTEP * dof_damping(i) : real(0));
+      w.H[i * WIDTH + j] = w.M[i * M_WIDTH + j] + (i == j ? TIMESTEP * dof_damping(i) : real(0));
     }
     if (lane < NV) w.H[lane * WIDTH + NV] = times_inertia(w, w.acceleration, lane);
   }
