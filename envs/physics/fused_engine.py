@@ -1,7 +1,7 @@
 """The `fused` engine: the whole control step as one function of a batch, compiled for the model.
 
-On CPUs the worlds are lanes of the machine's vectors, and threads of XLA's own pool step groups of them; all is computed
-in double precision, whatever the arrays are.
+On CPUs the worlds are lanes of the machine's vectors, and threads of XLA's own pool step groups of them. Numbers inside
+are double, whatever the arrays are.
 """
 
 from __future__ import annotations

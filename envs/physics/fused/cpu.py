@@ -27,6 +27,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ...progress import announce
 from .header import header
 from .model import Tables
 
@@ -34,15 +35,14 @@ Step = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], list[jax.Array]]
 
 HERE = pathlib.Path(__file__).parent
 INSTALL = "install g++ or clang++, or pip install 'pmt-jax[native]'"
-_SOURCES = ("lanes.cpp", *sorted(path.name for path in HERE.glob("*.h")))
+_SOURCES = ("lanes.cpp", *sorted(path.name for path in HERE.glob("lanes*.h")))
+_SOURCES += ("algebra.h", "formulae.h", "rows.h", "vector.h")
 _FLAGS = "-O3 -std=c++17 -shared -fPIC -fno-math-errno -fno-trapping-math -ffp-contract=fast".split()
 _PATIENCE = 600.0  # seconds for a compiler; one on a loaded machine took 20
 
-announce: Callable[[str], object] = lambda line: None  # takes a line before something is compiled
-
 
 class NoLibrary(Exception):
-    """No compiler made a library; the reason is one sentence."""
+    """No compiler made a library; the reason is the rest of a sentence that begins with the engine's name."""
 
 
 class Compiler(NamedTuple):
@@ -121,10 +121,15 @@ def _asked(command: tuple[str, ...]) -> tuple[Compiler, ...]:
 
 
 def obstacle() -> str | None:
-    """Why nothing can be compiled here, as the rest of a sentence; None if a compiler is there."""
+    """Why nothing can be compiled here, as the rest of a sentence; None if a compiler is there and has not failed."""
+    if _failures:
+        return f"could not be compiled: {_failures[-1]} ({INSTALL})"
     if next(compilers(), None) is None:
         return f"needs a C++ compiler; found none ({INSTALL})"
     return None
+
+
+_failures: list[str] = []  # of this process
 
 
 def describe() -> str:
@@ -166,7 +171,10 @@ def library(tables: Tables, real: str = "double") -> pathlib.Path:
         if reason is None:
             return found
         reasons.append(f"{shlex.join(compiler.command)}: {reason}")
-    raise NoLibrary("; ".join(reasons) or obstacle() or "no compiler works")
+    if not reasons:
+        raise NoLibrary(f"needs a C++ compiler; found none ({INSTALL})")
+    _failures.append("; ".join(reasons))
+    raise NoLibrary(f"could not be compiled: {_failures[-1]} ({INSTALL})")
 
 
 def _compile(compiler: Compiler, text: str, real: str, target: pathlib.Path) -> str | None:
