@@ -40,7 +40,7 @@ def _describe(name: str) -> int:
         "observation": f"{spec.obs_dim} numbers an agent; global state {spec.state_dim}",
         "costs": f"{spec.num_costs} an agent; limit {limits(spec.cost_limit)} an episode",
         "horizon": f"{spec.horizon} control steps",
-        "engines": _engines(env.engine),
+        "engines": _engines(env),
         "settings": ", ".join(known for known in (name, f"paper/{name}") if known in toml.names()) or "the defaults",
     }
     say(f"{name}: {toml.about(name) or 'a task of your own'}")
@@ -54,9 +54,10 @@ def _describe(name: str) -> int:
     return 0
 
 
-def _engines(engine: str) -> str:
+def _engines(env: tasks.Env) -> str:
     """Which engines can simulate a task here, and why others cannot."""
-    if engine == "xla":
+    if env.engine == "xla":
         return "none: the task is plain JAX"
-    _, obstacles = tasks.engines()
-    return "; ".join(f"{name}: {why}" if why else name for name, why in obstacles.items()) + f"; auto takes {engine}"
+    _, obstacles = tasks.engines(env)
+    listing = "; ".join(f"{name}: {why}" if why else name for name, why in obstacles.items())
+    return f"{listing}; auto takes {env.engine}"

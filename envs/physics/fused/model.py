@@ -18,12 +18,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 
-from ..contract import Readout
+if TYPE_CHECKING:
+    from ..contract import Readout
 
 MOST_DOFS = 32
 MOST_CONTACTS = 64  # of one world at a time, unless it can never have more
@@ -784,5 +785,9 @@ def _refused_readouts(m: mujoco.MjModel, readout: Readout) -> Iterator[str]:
     for name, (field, index) in readout.items():
         if field not in FIELDS:
             yield f"readout '{name}' is {field}; it knows {', '.join(FIELDS)}"
-        elif field == "subtree_com" and not all(m.body_jntnum[r] for r in _reading(m, field, index).rows):
+            continue
+        rows = [] if field == "qfrc_actuator" else _reading(m, field, index).rows
+        if field == "subtree_com" and not all(m.body_jntnum[row] for row in rows):
             yield f"readout '{name}' is the centre of mass of a body without joints"
+        if field in ("cinert", "cfrc_ext") and any(row and not m.body_weldid[row] for row in rows):
+            yield f"readout '{name}' is {field} of a body that nothing moves"
