@@ -112,7 +112,7 @@ def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout
     if physics == "mujoco" and device.platform != "cpu":
         return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
     if physics == "warp":
-        if device.platform != "gpu" or "nvidia" not in device.device_kind.lower():
+        if not _is_nvidia(device):
             return f"needs an NVIDIA GPU; found {device.device_kind} (take 'mujoco' on CPUs, 'mjx' elsewhere)"
         if installed_version("warp-lang") is None:
             return "needs warp-lang; found none; install it with pip install 'pmt-jax[warp]'"
@@ -120,12 +120,19 @@ def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout
 
 
 def _fused_obstacle(device: jax.Device, model: mujoco.MjModel | None, readout: Readout | None) -> str | None:
-    from .fused import cpu  # with its compilers, only if it is asked for
-
-    if device.platform != "cpu":
-        return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
+    if device.platform == "cpu":
+        from .fused import cpu as on_device  # with its compilers, only if it is asked for
+    elif _is_nvidia(device):
+        from .fused import gpu as on_device
+    else:
+        return f"runs on CPUs and NVIDIA GPUs; found {device.device_kind} (take 'mjx')"
     reason = None if model is None else _refused(model, readout)
-    return f"{reason} (take 'mujoco')" if reason else cpu.obstacle()
+    other = "mujoco" if device.platform == "cpu" else "warp"
+    return f"{reason} (take '{other}')" if reason else on_device.obstacle()
+
+
+def _is_nvidia(device: jax.Device) -> bool:
+    return device.platform == "gpu" and "nvidia" in device.device_kind.lower()
 
 
 def _refused(model: mujoco.MjModel, readout: Readout | None) -> str | None:

@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import batching, mlir
@@ -70,6 +69,11 @@ def make_step(tables: Tables, way: Way | None = None) -> Step:
         return qpos, qvel, warmstart, overflow[..., 0], read
 
     return step
+
+
+def obstacle() -> str | None:
+    """Why no step can be made here, as the rest of a sentence that begins with the engine's name; None if it can."""
+    return nvrtc.obstacle()
 
 
 def architecture() -> str:
@@ -140,7 +144,3 @@ def _lower(context: Any, *operands: Any, kernel: Kernel) -> Any:
 
 mlir.register_lowering(_call, _lower, platform="cuda")
 
-
-def as_float32(*arrays: Any) -> list[jax.Array]:
-    """What a step takes."""
-    return [jnp.asarray(x, np.float32) for x in arrays]

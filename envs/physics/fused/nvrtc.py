@@ -79,9 +79,7 @@ def _library() -> ctypes.CDLL:
             ctypes.CDLL(str(builtins), mode=ctypes.RTLD_GLOBAL)
         return ctypes.CDLL(str(sorted(found.glob("libnvrtc.so*"))[-1]))
     except OSError as error:
-        raise TaskError(
-            f"physics 'fused' needs NVIDIA's run-time compiler on a GPU; {error}; pip install -U 'jax[cuda13]'"
-        ) from None
+        raise TaskError(f"needs NVIDIA's run-time compiler; {error}; pip install -U 'jax[cuda13]'") from None
 
 
 def _folders() -> list[pathlib.Path]:
@@ -92,7 +90,7 @@ def _folders() -> list[pathlib.Path]:
 
 
 def obstacle() -> str | None:
-    """Why nothing can be compiled here, as a sentence; None if it can."""
+    """Why nothing can be compiled here, as the rest of a sentence; None if it can."""
     try:
         _library()
     except TaskError as error:
