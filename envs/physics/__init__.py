@@ -2,7 +2,7 @@
 
 | engine   | where         | what it is                                                          |
 |----------|---------------|---------------------------------------------------------------------|
-| `fused`  | CPU           | a control step compiled for the model, worlds in SIMD lanes         |
+| `fused`  | CPU, NVIDIA   | a control step compiled for the model: a world a SIMD lane or warp  |
 | `mujoco` | CPU           | MuJoCo's C engine on threads, called by XLA once per step           |
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
 | `warp`   | NVIDIA GPU    | MuJoCo-Warp, a control step as one CUDA graph, with that frame too  |

@@ -78,7 +78,7 @@ class Engine(Protocol):
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
           stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. The
           readout `overflow` is 1 if the step found no room for all contacts or constraints and is wrong, else 0: only
-          warp has buffers that can be too small without raising.
+          fused and warp have buffers that can be too small without raising.
         """
         ...
 
@@ -120,25 +120,31 @@ def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout
 
 
 def _fused_obstacle(device: jax.Device, model: mujoco.MjModel | None, readout: Readout | None) -> str | None:
-    if device.platform == "cpu":
-        from .fused import cpu as on_device  # with its compilers, only if it is asked for
-    elif _is_nvidia(device):
-        from .fused import gpu as on_device
-    else:
+    on_cpu = device.platform == "cpu"
+    if not on_cpu and not _is_nvidia(device):
         return f"runs on CPUs and NVIDIA GPUs; found {device.device_kind} (take 'mjx')"
-    reason = None if model is None else _refused(model, readout)
-    other = "mujoco" if device.platform == "cpu" else "warp"
-    return f"{reason} (take '{other}')" if reason else on_device.obstacle()
+    reason = None if model is None else _refused(model, readout, on_cpu)
+    if reason:
+        return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
+    if on_cpu:
+        from .fused import cpu  # with its compilers, only if it is asked for
+
+        return cpu.obstacle()
+    from .fused import nvrtc
+
+    return nvrtc.obstacle()
 
 
 def _is_nvidia(device: jax.Device) -> bool:
     return device.platform == "gpu" and "nvidia" in device.device_kind.lower()
 
 
-def _refused(model: mujoco.MjModel, readout: Readout | None) -> str | None:
-    from .fused.model import obstacle as refused
+def _refused(model: mujoco.MjModel, readout: Readout | None, on_cpu: bool = True) -> str | None:
+    from .fused import model as tables_of
+    from .fused import threads
 
-    return refused(model, readout)
+    reason = tables_of.obstacle(model, readout)
+    return reason if reason or on_cpu else threads.obstacle(tables_of.tables(model, 1, readout or {}))
 
 
 def explain() -> dict[str, str | None]:

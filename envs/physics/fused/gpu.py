@@ -44,8 +44,8 @@ class Kernel:
 def make_step(tables: Tables, way: Way | None = None) -> Step:
     """A function of float32 `qpos` [..., nq], `qvel`, `warmstart` [..., nv] and `ctrl` [..., nu].
 
-    It returns the new qpos, qvel and warm start, `overflow` [...], and the readouts [..., *shape] by name. Rows with a
-    number that is not finite come out as nan, and touch no other row. vmap, however nested, only makes the batch larger.
+    It returns the new qpos, qvel and warm start, `overflow` [...], and the readouts [..., *shape] by name. Rows with
+    a number that is not finite come out as nan, and touch no other row. vmap, however nested, makes the batch larger.
 
     Args:
       tables: of the model.
@@ -63,17 +63,10 @@ def make_step(tables: Tables, way: Way | None = None) -> Step:
     def step(*state_and_ctrl: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
         qpos, qvel, warmstart, overflow, *read = run(*state_and_ctrl)
         shapes = {name: reading.shape for name, reading in tables.readings.items()}
-        read = {
-            name: x.reshape(*x.shape[:-1], *shape) for (name, shape), x in zip(shapes.items(), read, strict=True)
-        }
+        read = {name: x.reshape(*x.shape[:-1], *shape) for (name, shape), x in zip(shapes.items(), read, strict=True)}
         return qpos, qvel, warmstart, overflow[..., 0], read
 
     return step
-
-
-def obstacle() -> str | None:
-    """Why no step can be made here, as the rest of a sentence that begins with the engine's name; None if it can."""
-    return nvrtc.obstacle()
 
 
 def architecture() -> str:
@@ -143,4 +136,3 @@ def _lower(context: Any, *operands: Any, kernel: Kernel) -> Any:
 
 
 mlir.register_lowering(_call, _lower, platform="cuda")
-

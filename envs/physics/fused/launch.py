@@ -59,9 +59,7 @@ class _Loaded:
             arguments = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
             sizes = (rows, 1, 1, threads.LANES, 1, 1, 0)
             function = self._function(context.value)
-            _check(
-                "cuLaunchKernel", driver.cuLaunchKernel(function, *sizes, ctypes.c_void_p(stream), arguments, None)
-            )
+            _check("cuLaunchKernel", driver.cuLaunchKernel(function, *sizes, ctypes.c_void_p(stream), arguments, None))
         finally:
             driver.cuCtxPopCurrent_v2(ctypes.byref(context))
 

@@ -1,14 +1,16 @@
 // MuJoCo's control step, one warp of 32 threads a world.
 //
-// The tables of a model are written by threads.py: trees of hinges and slides on a free root or on the world; spheres and
-// capsules on a floor and on each other; pyramids, limits, springs, fluid; RK4, or Euler with implicit damping.
+// The tables of a model are written by threads.py: trees of hinges and slides on a free root or on the world; spheres
+// and capsules on a floor and on each other; pyramids, limits, springs, fluid; RK4, or Euler with implicit damping.
+// threads_smooth.h, _contacts.h, _solver.h, _readouts.h and _step.h are the step in this order; this file is what a
+// warp needs besides: lanes, algebra, sums.
 //
-// The same source compiles for a CPU, where EACH_LANE is a loop. Rules: in a phase (the body of EACH_LANE) no lane reads
-// what another lane writes in it, and MEET ends a phase whose results other lanes need. What a lane keeps from one phase
-// to another is a PerLane.
+// The same source compiles for a CPU, where EACH_LANE is a loop. Rules: in a phase (the body of EACH_LANE) no lane
+// reads what another lane writes in it, and MEET ends a phase whose results other lanes need. What a lane keeps from
+// one phase to another is a PerLane.
 //
 // Everything inside an evaluation is in the base's frame: that of the free root, with its origin, or else the world's.
-// Only the height of the base and the directions "up" and "world's y" enter, so places far from the origin cost no bits.
+// Only the height of the base and the directions "up" and "world's y" enter: places far from the origin cost no bits.
 #pragma once
 #ifndef __CUDACC_RTC__
 #include <math.h>

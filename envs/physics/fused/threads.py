@@ -1,4 +1,4 @@
-"""The tables of a model as C++ for the schedule "one warp a world": threads.h, threads_step.h and threads_readouts.h.
+"""The tables of a model as C++ for the schedule "one warp a world": threads.h and threads_*.h.
 
 The warp's lanes take the model's items (joints, bodies, dofs, entries of matrices, contacts), so what differs between
 items is looked up by lane, and what is the same for all becomes a constant. The order in which M's factor is worked out
@@ -201,8 +201,8 @@ def _sizes(out: _Writer, t: Tables) -> None:
         FLUID=bool(t.boxes),
         BOXES=len(t.boxes),
         FILLS=t.fills,
-        DAMPED=t.damping.any(),
-        SPRINGS=t.stiffness.any(),
+        DAMPED=bool(t.damping.any()),
+        SPRINGS=bool(t.stiffness.any()),
         ITERATIONS=t.iterations,
     )
     out.constant(
@@ -362,8 +362,9 @@ def _factor(out: _Writer, t: Tables, plan: Schedule) -> None:
 
 def _contacts(out: _Writer, t: Tables) -> None:
     """Candidates: points over the floor, then pairs."""
-    # What rounding leaves of 0 (MuJoCo's is 1e-15 in f64): sine squared of parallel axes, m between segments that cross.
-    out.line("constexpr real PARALLEL = sizeof(real) == 4 ? real(1e-10) : real(0);")
+    # Of mjraw_CapsuleCapsule, the sine squared of axes that are parallel; of mjraw_SphereSphere, in m, what rounding
+    # leaves of the distance between segments that cross.
+    out.line("constexpr real PARALLEL = real(1e-8);")
     out.line("constexpr real CROSSING = sizeof(real) == 4 ? real(1e-6) : real(1e-15);")
     with out.record("point"):
         out.vectors("point_centre", (p.centre for p in t.points))
@@ -402,7 +403,8 @@ def _contacts(out: _Writer, t: Tables) -> None:
 def _far(t: Tables, pair: Pair) -> float:
     """m2, the square of the distance of two middles beyond which no contact is possible."""
     both = [t.segments[k] for k in (pair.first, pair.second)]
-    return (sum(np.linalg.norm(s.half) + s.radius for s in both) + pair.contact.margin) ** 2 * 1.0001
+    reach = sum(float(np.linalg.norm(s.half)) + s.radius for s in both) + pair.contact.margin
+    return 1.0001 * reach**2
 
 
 def _limits(out: _Writer, t: Tables) -> None:

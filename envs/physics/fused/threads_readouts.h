@@ -1,5 +1,6 @@
-// What tasks read of the last evaluation: fields of mjData, in the world's frame.
+// What tasks read of the last evaluation: fields of mjData, in the world's frame; see threads.h.
 #pragma once
+#include "threads_solver.h"
 
 struct Outputs {
   real* reading[READINGS + 1];
