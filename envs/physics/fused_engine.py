@@ -68,7 +68,7 @@ class FusedEngine:
         ends = np.cumsum([FIELDS[reading.field] * len(reading.rows) for reading in readings.values()])
         parts = jnp.split(flat, ends[:-1].tolist(), axis=1)
         out = {
-            name: part.reshape(-1, *reading.shape)
+            name: part.reshape(len(qpos), *reading.shape)
             for (name, reading), part in zip(readings.items(), parts, strict=False)
         }
         return PhysicsState(qpos, qvel, warmstart), out | {"overflow": overflow[:, 0]}

@@ -2,9 +2,9 @@
 #pragma once
 #include "algebra.h"
 
-// Below these, MuJoCo 3.17 takes two capsules for parallel, and two centres for one (mjMINVAL). Rounding in float makes
-// as much of what is zero in double.
-constexpr Real PARALLEL = SINGLE ? Real(1e-9) : Real(1e-15);
+// Segments are parallel where the square of the sine between them is below this, and centres are one below TINY (mjMINVAL).
+// MuJoCo 3.17 has 1e-8 and 1e-15; rounding in float makes as much of what is zero in double.
+constexpr Real PARALLEL = SINGLE ? Real(1e-6) : Real(1e-8);
 constexpr Real TINY = SINGLE ? Real(1e-7) : Real(1e-15);
 
 // Impedance at a distance beyond the margin: a power of 2 with its midpoint at a half (engine_core_constraint.c,
@@ -34,26 +34,16 @@ FUNCTION Vec3 tangent(const World& world, Vec3 normal) {
   return tangent(world, normal, select(level, world.y, world.up));
 }
 
-// Where two segments are nearest: shares of their half axes, -1 to 1, and a second place where they are parallel
-// (engine_collision_primitive.c, mjraw_CapsuleCapsule).
+// Where two segments are nearest: shares of their half axes, -1 to 1. Where they are parallel, both ends of the stretch
+// that they share (mjraw_CapsuleCapsule).
 struct Nearest {
-  Num first, second;              // the contact that any pair has
-  Mask two;                       // worlds with another contact at
-  Num first_again, second_again;  // these shares
+  Num first, second;
+  Mask two;  // worlds with another contact, at these shares
+  Num first_again, second_again;
 };
 
 struct Segments {
   Vec3 middle1, middle2, half1, half2;
-  Num radii, margin;
-  MEMBER Vec3 between(Num first, Num second) const {
-    return middle2 + half2 * second - (middle1 + half1 * first);
-  }
-  // Whether spheres at these places touch.
-  MEMBER Mask touch(Num first, Num second) const {
-    const Vec3 apart = between(first, second);
-    const Num reach = radii + margin;
-    return dot(apart, apart) <= reach * reach;
-  }
 };
 
 FUNCTION Nearest nearest_of_sphere_and_capsule(const Segments& s) {
@@ -68,33 +58,27 @@ FUNCTION Nearest nearest_of_capsules(const Segments& s) {
   const Num aa = dot(s.half1, s.half1), ab = -dot(s.half1, s.half2), bb = dot(s.half2, s.half2);
   const Num u = -dot(s.half1, apart), v = dot(s.half2, apart);
   const Num determinant = aa * bb - ab * ab;
-  const Mask parallel = size_of(determinant) < Num(PARALLEL);
+  const Mask parallel = determinant < Num(PARALLEL) * aa * bb;
   const Num divisor = select(parallel, one, determinant);  // a world whose capsules are parallel must not see NaN
   Num first = (bb * u - ab * v) / divisor, second = (aa * v - ab * u) / divisor;
   second = select(first > one, (v - ab) / bb, select(first < less, (v + ab) / bb, second));
   first = clip(first, less, one);
-  const Num at_end = clip((u - ab) / aa, less, one), at_start = clip((u + ab) / aa, less, one);
-  first = select(second > one, at_end, select(second < less, at_start, first));
+  const Num of_end = (u - ab) / aa, of_start = (u + ab) / aa;  // of the second, on the first
+  first = select(second > one, clip(of_end, less, one), select(second < less, clip(of_start, less, one), first));
   second = clip(second, less, one);
-  Nearest found = {first, second, mask_of(false), first, second};
+  Nearest found = {first, second, parallel, first, second};
   if (!any(parallel)) return found;
-  // Ends of the first on the second, then ends of the second on the first; the first two that touch count.
-  const Num firsts[4] = {one, less, at_end, at_start};
-  const Num seconds[4] = {clip((v - ab) / bb, less, one), clip((v + ab) / bb, less, one), one, less};
-  Mask none_yet = parallel, one_yet = mask_of(false);
-  found.first = select(parallel, firsts[0], found.first);
-  found.second = select(parallel, seconds[0], found.second);
-  for (int k = 0; k < 4; ++k) {
-    const Mask touches = s.touch(firsts[k], seconds[k]);
-    const Mask again = one_yet & touches, now = none_yet & touches;
-    found.first_again = select(again, firsts[k], found.first_again);
-    found.second_again = select(again, seconds[k], found.second_again);
-    found.first = select(now, firsts[k], found.first);
-    found.second = select(now, seconds[k], found.second);
-    found.two |= again;
-    one_yet = (one_yet | now) & !again;
-    none_yet &= !touches;
+  // An end of the second where it is beside the first, else the end of the first that it is beyond.
+  const Num on_first[2] = {clip(of_end, less, one), clip(of_start, less, one)};
+  Num on_second[2] = {one, less};
+  for (int k = 0; k < 2; ++k) {
+    const Mask beyond = size_of(k ? of_start : of_end) > one;
+    on_second[k] = select(beyond, clip((v - ab * on_first[k]) / bb, less, one), on_second[k]);
   }
+  found.first = select(parallel, on_first[0], found.first);
+  found.second = select(parallel, on_second[0], found.second);
+  found.first_again = on_first[1];
+  found.second_again = on_second[1];
   return found;
 }
 

@@ -86,10 +86,10 @@ FUNCTION void floor_contacts(Worlds& w) {
 FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num second, Mask wanted) {
   const PairRow& pair = PAIRS[c];
   const SegmentRow &one = SEGMENTS[pair.first], &two = SEGMENTS[pair.second];
-  const Vec3 apart = s.between(first, second);
+  const Vec3 on_first = s.middle1 + s.half1 * first, apart = s.middle2 + s.half2 * second - on_first;
   const Num length = root(dot(apart, apart));
-  Num distance = length - s.radii;
-  Mask has = wanted & (distance <= s.margin);
+  Num distance = length - Num(one.radius + two.radius);
+  Mask has = wanted & (distance <= Num(pair.contact.margin));
   if (!any(has)) return;
   has = admitted(w, has);
   // A world without this contact must not see NaN: 0 * NaN would stay.
@@ -97,7 +97,7 @@ FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num s
   const Vec3 side1 = turned_with_body(w, one.body, one.side), side2 = turned_with_body(w, two.body, two.side);
   const Vec3 normal = select(has, normal_between(w.world, apart, length, side1, side2), w.world.x);
   const Vec3 surface = normal * (Num(one.radius) + Num(Real(.5)) * distance);
-  const Vec3 place = select(has, s.middle1 + s.half1 * first + surface, vec(0, 0, 0));
+  const Vec3 place = select(has, on_first + surface, vec(0, 0, 0));
   const Frame frame = frame_of(place, normal, tangent(w.world, normal), pair.contact.friction);
   Slot& slot = w.slots[w.slot_count++];
   slot.dofs = PAIR_DOFS[c], slot.columns = pair.columns, slot.place1 = one.place, slot.place2 = two.place;
@@ -122,8 +122,7 @@ FUNCTION void pair_contacts(Worlds& w) {
     const int one = pair.first, two = pair.second;
     const Vec3 apart = middles[one] - middles[two];
     if (!any(dot(apart, apart) <= Num(pair.reach * pair.reach * Real(1.0001)))) continue;
-    const Num radii = Num(SEGMENTS[one].radius + SEGMENTS[two].radius);
-    const Segments s = {middles[one], middles[two], halves[one], halves[two], radii, Num(pair.contact.margin)};
+    const Segments s = {middles[one], middles[two], halves[one], halves[two]};
     const Num none = dot(w.world.up, w.world.up) * Num(0);
     Nearest nearest = {none, none, mask_of(false), none, none};
     if (SEGMENTS[one].capsule) nearest = nearest_of_capsules(s);

@@ -744,7 +744,7 @@ def _refused_motors(m: mujoco.MjModel) -> Iterator[str]:
     special = m.actuator_forcelimited.astype(bool)
     for array in ("actuator_damping", "actuator_dampingpoly", "actuator_armature"):
         values = np.asarray(getattr(m, array, np.zeros(m.nu)))
-        special = special | (values.reshape(m.nu, -1) != 0).any(1)
+        special = special | (values.reshape(m.nu, -1) != 0).any(1) if m.nu else special
     for a in range(m.nu):
         name = m.actuator(a).name or a
         if not (joint[a] and plain[a]) or special[a] or m.nactuator != m.nu:
