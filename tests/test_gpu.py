@@ -291,25 +291,30 @@ def test_devices_share_a_batch():
     assert same(jax.jit(step)(*states), shared(*states))
 
 
-def test_training_repeats_bit_for_bit_and_a_seed_beside_others_is_that_seed():
-    run = make_setup(load_config("ant_2x4", num_envs=64, rollout_length=16, hidden=(64, 64)))
-    assert run.vector.env.engine == "fused"
+def test_a_seed_beside_others_moves_as_it_does_alone():
+    env = envs.make("ant_2x4")
+    assert env.engine == "fused"
+    starts = jax.jit(jax.vmap(jax.vmap(env.reset)))(jax.random.split(jax.random.key(0), (3, 64)))
+    keys = jax.random.split(jax.random.key(1), 3)
 
-    def physics_of(key):
-        """Where a seed's environments are after 100 steps of random actions."""
-        env = run.vector.env
-        state = jax.vmap(env.reset)(jax.random.split(key, 64))
+    def after(state, key):
+        """Where 100 steps of random actions lead."""
 
         def step(state, key):
             return jax.vmap(env.step)(state, jax.random.uniform(key, (64, 2, 4), minval=-1.0, maxval=1.0)), None
 
-        return jax.lax.scan(step, state, jax.random.split(key, 100))[0].carry
+        return jax.lax.scan(step, state, jax.random.split(key, 100))[0].carry.physics
 
-    keys = jax.random.split(jax.random.key(0), 3)
-    beside = jax.jit(jax.vmap(physics_of))(keys)
-    assert same(jax.tree.map(lambda x: x[1], beside), jax.jit(physics_of)(keys[1]))
+    beside = jax.jit(jax.vmap(after))(starts, keys)
+    alone = jax.jit(after)(jax.tree.map(lambda x: x[1], starts), keys[1])
+    assert same(jax.tree.map(lambda x: x[1], beside), alone)
+
+
+def test_training_repeats_bit_for_bit():
+    run = make_setup(load_config("ant_2x4", num_envs=64, rollout_length=16, hidden=(64, 64)))
+    assert run.vector.env.engine == "fused"
     update = jax.jit(lambda key: learner.train_chunk(run, run.hyper, learner.init(run, run.hyper, key), 3))
-    first, again = (jax.device_get(update(keys[0])) for _ in range(2))
+    first, again = (jax.device_get(update(jax.random.key(0))) for _ in range(2))
     assert same(jax.tree.map(as_numbers, first), jax.tree.map(as_numbers, again))
 
 
