@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import pathlib
 import types
@@ -23,9 +24,12 @@ __all__ = [
     "VectorEnv",
     "VectorState",
     "absolute",
+    "advice",
+    "announcing",
     "baseline",
     "check",
     "columns",
+    "compiler",
     "declarations",
     "did_you_mean",
     "engines",
@@ -121,8 +125,10 @@ def installed_version(package: str) -> str | None:
     return importlib.import_module(f"{_envs().__name__}.versions").installed_version(package)
 
 
-def engines() -> tuple[str, dict[str, str | None]]:
+def engines(env: Env | None = None) -> tuple[str, dict[str, str | None]]:
     """The physics engine that `auto` takes here, and for each engine why it cannot run here, None if it can.
+
+    With a task, why an engine cannot step its model counts, too.
 
     Raises:
       UsageError: MuJoCo is missing or of another version.
@@ -131,9 +137,35 @@ def engines() -> tuple[str, dict[str, str | None]]:
     try:
         physics = importlib.import_module(f"{package.__name__}.physics")
         physics.check_versions()
-        return physics.resolve("auto"), physics.explain()
+        model = _model(env)
+        return physics.resolve("auto", model), {name: physics.obstacle(name, model) for name in physics.ENGINES}
     except package.TaskError as error:
         raise UsageError(str(error)) from error
+
+
+def _model(env: Env | None) -> Any:
+    """The MjModel that a task's physics steps, as far as the task declares one."""
+    return (
+        getattr(importlib.import_module(f"{_envs().__name__}.base").declarations(env).picture, "model", None)
+        if env is not None
+        else None
+    )
+
+
+def advice(env: Env) -> str | None:
+    """What would make a task's physics faster on this machine, as a sentence; None if nothing is known."""
+    model = _model(env)
+    return importlib.import_module(f"{_envs().__name__}.physics").advice(model) if model is not None else None
+
+
+def compiler() -> str:
+    """What compiles the engine `fused` here; needs one."""
+    return importlib.import_module(f"{_envs().__name__}.physics.fused.cpu").describe()
+
+
+def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:
+    """Prints a line before something that takes long while a task is made inside."""
+    return importlib.import_module(f"{_envs().__name__}.progress").announcing(say)
 
 
 def make(name: str, physics: str = "auto", **options: Any) -> Env:

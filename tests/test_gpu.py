@@ -1,4 +1,4 @@
-"""What only a GPU can show: MJX-Warp against the C engine, and a learner that computes the same as on a CPU.
+"""What only a GPU can show: its engines against C's and the same bits again, and a learner that computes as on a CPU.
 
 pytest -m gpu tests/test_gpu.py
 """
@@ -21,11 +21,15 @@ import envs
 from envs import physics
 from envs.ant import corridor
 from envs.physics import warp_engine
+from envs.physics.fused import gpu, threads
+from envs.physics.fused.model import tables
+from envs.velocity import robots
 from places import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play
 from pmt_jax.training.run_folder import MATMUL_PRECISION
+from threads_on_cpu import compiled, runner
 
 pytestmark = pytest.mark.gpu
 
@@ -55,9 +59,9 @@ def on_a_cpu(script: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, env=environment, stdout=subprocess.PIPE)
 
 
-def returns(task: str) -> list[float]:
+def returns(task: str, engine: str) -> list[float]:
     """Returns of `EPISODES` episodes of uniformly random actions, from starts that are the same on every engine."""
-    env = envs.make(task)
+    env = envs.make(task, physics=engine)
     shape = (EPISODES, env.spec.num_agents, env.spec.action_dim)
 
     def act(_, t):
@@ -91,13 +95,17 @@ def test_one_step_of_the_hands_is_that_of_c(tmp_path):
     assert np.median(error) < 1e-5
 
 
-@pytest.mark.parametrize("task", ["ant_2x4", "hand_over_2x6"])
-def test_random_policy_earns_the_same_on_warp_and_c(task):
-    with on_a_cpu(f"import json; from test_gpu import returns; print(json.dumps(returns({task!r})))") as process:
-        ours = returns(task)
+@pytest.mark.parametrize(
+    ("task", "engine"),
+    [("ant_2x4", "warp"), ("ant_2x4", "fused"), ("velocity_humanoid_9_8", "fused"), ("hand_over_2x6", "warp")],
+)
+def test_random_policy_earns_the_same_on_a_gpu_and_c(task, engine):
+    script = f"import json; from test_gpu import returns; print(json.dumps(returns({task!r}, 'mujoco')))"
+    with on_a_cpu(script) as process:
+        ours = returns(task, engine)
         theirs = json.loads(process.communicate()[0].splitlines()[-1])
     p = scipy.stats.ks_2samp(ours, theirs).pvalue
-    print(f"{task}: mean return warp {np.mean(ours):.2f}, C {np.mean(theirs):.2f}, KS p {p:.2f}")
+    print(f"{task}: mean return {engine} {np.mean(ours):.2f}, C {np.mean(theirs):.2f}, KS p {p:.2f}")
     assert p > 0.05
 
 
@@ -126,9 +134,12 @@ def test_lost_contacts_show(contacts, lost):
     assert bool(out["overflow"].any()) == lost
 
 
-def test_training_stops_where_contacts_were_lost(cli, tmp_path, monkeypatch):
-    monkeypatch.setattr(warp_engine, "_MOST_CONTACTS", 1)
-    settings = ["--num-envs", 64, "--rollout-length", 64, "--steps", 4096 * 4, "--no-cache"]
+@pytest.mark.parametrize(
+    ("engine", "module", "most"), [("warp", warp_engine, "_MOST_CONTACTS"), ("fused", threads, "MOST_SLOTS")]
+)
+def test_training_stops_where_contacts_were_lost(cli, tmp_path, monkeypatch, engine, module, most):
+    monkeypatch.setattr(module, most, 1)
+    settings = ["--physics", engine, "--num-envs", 64, "--rollout-length", 64, "--steps", 4096 * 4, "--no-cache"]
     code, out, _ = cli("train", "ant_2x4", "--out", tmp_path / "x", *settings)
     assert code == 1 and "no room for all contacts" in out
 
@@ -163,3 +174,149 @@ def test_controls_may_come_straight_from_a_scans_inputs():
         state, controls
     )
     assert np.isfinite(jax.block_until_ready(after).qpos).all()
+
+
+# -- the engine fused --
+
+
+@pytest.mark.parametrize("agents", [2, 4])
+def test_fused_repeats_the_recorded_transitions(agents):
+    with np.load(DATA / f"ant_reference_{agents}x{8 // agents}.npz") as data:
+        rows = dict(data)
+    env = envs.make(f"ant_{agents}x{8 // agents}")
+    assert env.engine == "fused"
+    start = jax.vmap(env.restore)(rows["qpos0"], rows["qvel0"], rows["warm0"], rows["torso_xpos0"])
+    action = rows["action"].reshape(-1, agents, 8 // agents).astype(np.float32)
+    after = jax.jit(jax.vmap(env.step))(start, action)
+    error = np.abs(np.asarray(after.carry.physics.qpos, np.float64) - rows["qpos1"]).max(axis=1)
+    print(f"qpos error: median {np.median(error):.2g}, 99 % {np.quantile(error, 0.99):.2g}, largest {error.max():.2g}")
+    assert np.median(error) < 1e-6 and np.quantile(error, 0.99) < 5e-5
+    np.testing.assert_array_equal(after.terminated, rows["done"])
+    np.testing.assert_array_equal(after.info["cost_obj"], rows["cost_obj"])
+    error = np.abs(np.asarray(after.info["reward_contact"]) - rows["reward_contact"])
+    assert (rows["reward_contact"] < 0).any() and np.quantile(error, 0.99) < 1e-6
+
+
+READOUT = {name: (name, slice(None)) for name in ("xpos", "xquat", "cinert", "cvel", "cfrc_ext", "qfrc_actuator")}
+
+
+@functools.cache
+def robot(name: str) -> tuple:
+    """Tables of a robot and 200 states [n, D] that random controls lead to: qpos, qvel, warm start, ctrl."""
+    model = corridor.model() if name == "corridor" else robots.model(name)
+    made_of = tables(model, corridor.SUBSTEPS if name == "corridor" else robots.ROBOTS[name].substeps, READOUT)
+    rng, count = np.random.default_rng(0), 200
+    qpos = model.qpos0 + rng.uniform(-0.1, 0.1, (count, model.nq))
+    if made_of.has_free:
+        qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    speed, still = 0.1 * rng.normal(size=(count, model.nv)), np.zeros((count, model.nv))
+    ctrl = rng.uniform(-1, 1, (31, count, model.nu)) * model.actuator_ctrlrange[:, 1]
+    states, step = [jnp.asarray(x, jnp.float32) for x in (qpos, speed, still)], jax.jit(gpu.make_step(made_of))
+    for controls in ctrl[:30]:
+        states = step(*states, jnp.asarray(controls, jnp.float32))[:3]
+    return made_of, (*states, jnp.asarray(ctrl[30], jnp.float32))
+
+
+every_robot = pytest.mark.parametrize("name", ["corridor", *robots.ROBOTS])
+
+
+def same(a, b) -> bool:
+    """Whether two trees have the same bits, but for their shapes."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array_equal(np.ravel(x), np.ravel(y), equal_nan=True) for x, y in pairs)
+
+
+@compiled
+@every_robot
+def test_fused_on_a_gpu_is_the_same_source_on_a_cpu(name):
+    made_of, states = robot(name)
+    qpos, qvel, *_, overflow, read = jax.jit(gpu.make_step(made_of))(*states)
+    assert not np.asarray(overflow).any()
+    found = {"qpos": qpos, "qvel": qvel}
+    found["read"] = np.concatenate([np.reshape(read[field], (len(qpos), -1)) for field in made_of.readings], axis=1)
+    for dtype in (np.float32, np.float64):
+        right = runner(made_of, dtype)(*states)
+        for field, most in (("qpos", 2e-5), ("qvel", 2e-3), ("read", 2e-2)):
+            scale = np.maximum(1.0, np.abs(right[field]))
+            error = (np.abs(np.asarray(found[field], np.float64) - right[field]) / scale).max(axis=1)
+            print(f"{name} {dtype.__name__} {field}: median {np.median(error):.2g}, largest {error.max():.2g}")
+            assert np.quantile(error, 0.95) < most
+
+
+@every_robot
+def test_fused_gives_the_same_bits_again_alone_and_nested(name):
+    made_of, states = robot(name)
+    step = jax.jit(gpu.make_step(made_of))
+    found = step(*states)
+    assert same(found, step(*states))
+    nested = jax.jit(jax.vmap(jax.vmap(gpu.make_step(made_of))))
+    assert same(found, nested(*(x.reshape(10, 20, -1) for x in states)))
+    alone = step(*(x[7] for x in states))
+    assert same(jax.tree.map(lambda x: x[7], found), alone)
+
+
+@every_robot
+def test_the_host_launches_what_xla_launches(name):
+    """The name of XLA's call is its own: where this fails, `gpu.make_step` takes the second way by itself."""
+    assert gpu.knows_call()
+    made_of, states = robot(name)
+    by_xla, by_host = (jax.jit(gpu.make_step(made_of, way)) for way in ("xla", "host"))
+    assert same(by_xla(*states), by_host(*states))
+
+
+def test_an_xla_without_the_call_is_noticed(monkeypatch):
+    monkeypatch.setattr(gpu, "_CALL", "no_such_call")
+    assert not gpu.knows_call.__wrapped__()
+
+
+def test_broken_states_stay_broken_and_touch_no_other():
+    made_of, states = robot("humanoid")
+    step = jax.jit(gpu.make_step(made_of))
+    whole = step(*states)
+    qpos, qvel, warm, ctrl = states
+    broken = step(qpos, qvel.at[3, 5].set(jnp.nan), warm.at[5, 0].set(jnp.inf), ctrl.at[7, 2].set(-jnp.inf))
+    rest = np.setdiff1d(np.arange(len(qpos)), [3, 5, 7])
+    for before, after in zip(jax.tree.leaves(whole), jax.tree.leaves(broken), strict=True):
+        np.testing.assert_array_equal(np.asarray(after)[rest], np.asarray(before)[rest])
+    for after in jax.tree.leaves((broken[:3], broken[4])):
+        assert np.isnan(np.asarray(after)[[3, 5, 7]]).all()
+
+
+@pytest.mark.skipif(jax.device_count() < 2, reason="one GPU")
+def test_devices_share_a_batch():
+    made_of, states = robot("corridor")
+    step, mesh = gpu.make_step(made_of), jax.make_mesh((2,), ("env",))
+    parts = jax.sharding.PartitionSpec("env")
+    shared = jax.jit(jax.shard_map(step, mesh=mesh, in_specs=parts, out_specs=parts, check_vma=False))
+    assert same(jax.jit(step)(*states), shared(*states))
+
+
+def test_a_seed_beside_others_moves_as_it_does_alone():
+    env = envs.make("ant_2x4")
+    assert env.engine == "fused"
+    starts = jax.jit(jax.vmap(jax.vmap(env.reset)))(jax.random.split(jax.random.key(0), (3, 64)))
+    keys = jax.random.split(jax.random.key(1), 3)
+
+    def after(state, key):
+        """Where 100 steps of random actions lead."""
+
+        def step(state, key):
+            return jax.vmap(env.step)(state, jax.random.uniform(key, (64, 2, 4), minval=-1.0, maxval=1.0)), None
+
+        return jax.lax.scan(step, state, jax.random.split(key, 100))[0].carry.physics
+
+    beside = jax.jit(jax.vmap(after))(starts, keys)
+    alone = jax.jit(after)(jax.tree.map(lambda x: x[1], starts), keys[1])
+    assert same(jax.tree.map(lambda x: x[1], beside), alone)
+
+
+def test_training_repeats_bit_for_bit():
+    run = make_setup(load_config("ant_2x4", num_envs=64, rollout_length=16, hidden=(64, 64)))
+    assert run.vector.env.engine == "fused"
+    update = jax.jit(lambda key: learner.train_chunk(run, run.hyper, learner.init(run, run.hyper, key), 3))
+    first, again = (jax.device_get(update(jax.random.key(0))) for _ in range(2))
+    assert same(jax.tree.map(as_numbers, first), jax.tree.map(as_numbers, again))
+
+
+def as_numbers(leaf):
+    return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)

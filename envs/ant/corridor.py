@@ -83,7 +83,7 @@ class AntCorridor:
       num_agents: 2 (four motors each: the two legs in front, the two behind) or 4 (one leg each: legs 4, 1, 2, 3). The
         order is the one that the reference code effectively uses, not the one its partition table declares.
       partition: another division of the eight motors in place of `num_agents`, agents apart by `|`: `0,1,2,3,4,5|6,7`.
-      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
+      physics: `auto`, `fused`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
       observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
         learners that keep running moments).
@@ -92,7 +92,7 @@ class AntCorridor:
       sway: `none`, or the corridor moves along y by 1 m x sin(phase), a period in 10 s from a random phase: danger that
         is not where it was. `seen`: observations measure the place from where the centre line is now, and hold its
         velocity. `hidden`: they measure it from where the line is on average.
-      threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
+      threads: of `fused` and `mujoco`, which the devices of a process share; all usable CPUs if None.
     """
 
     shares_cost = True

@@ -187,10 +187,10 @@ class HandOver:
         threads: int | None = None,
     ):
         num_agents, self._costly, self._free = VARIANTS[one_of("variant", variant, VARIANTS)]
-        physics = resolve(physics)
         one_of("egg", egg, ("auto", "ellipsoid", "capsule"))
+        physics = resolve(physics, model(one_of("object", object, OBJECTS), egg == "capsule", full_hand))
         capsule = egg == "capsule" or (egg == "auto" and physics == "mjx")
-        self.model = model(one_of("object", object, OBJECTS), capsule, full_hand)
+        self.model = model(object, capsule, full_hand)
         hinges = slice(0, HINGES)
         self._engine = make_engine(
             self.model,

@@ -1,7 +1,8 @@
-"""One physics contract, three engines behind it.
+"""One physics contract, four engines behind it.
 
 | engine   | where         | what it is                                                          |
 |----------|---------------|---------------------------------------------------------------------|
+| `fused`  | CPU, NVIDIA   | a control step compiled for the model: a world a SIMD lane or warp  |
 | `mujoco` | CPU           | MuJoCo's C engine on threads, called by XLA once per step           |
 | `mjx`    | any XLA device| MJX, pure XLA, with C's contact frame for capsules on planes        |
 | `warp`   | NVIDIA GPU    | MuJoCo-Warp, a control step as one CUDA graph, with that frame too  |
@@ -27,8 +28,19 @@ import copy
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from ..errors import one_of
-from .contract import ENGINES, Engine, PhysicsState, Readout, check_versions, explain, obstacle, resolve, usable_cpus
+from ..errors import TaskError, one_of
+from .contract import (
+    ENGINES,
+    Engine,
+    PhysicsState,
+    Readout,
+    advice,
+    check_versions,
+    explain,
+    obstacle,
+    resolve,
+    usable_cpus,
+)
 
 if TYPE_CHECKING:
     import mujoco
@@ -39,6 +51,7 @@ __all__ = [
     "Engine",
     "PhysicsState",
     "Readout",
+    "advice",
     "check_versions",
     "explain",
     "make_engine",
@@ -72,25 +85,35 @@ def make_engine(
         and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors
         grow to 1e-3.
       fast_contacts: names of the geoms that keep their contacts when the solver is fast; empty keeps all.
-      threads: of the `mujoco` engine; the process's usable CPUs if None.
-      contacts: of the `warp` engine: room for so many contacts in a world; derived from the model if None.
+      threads: of `fused` and `mujoco`; the process's usable CPUs if None.
+      contacts: of `fused` and `warp`: room for so many contacts in a world; derived from the model if None.
 
     Raises:
-      TaskError: unknown engine or solver, or an engine that cannot run here.
+      TaskError: unknown engine or solver, or an engine that cannot run here, or not with this model.
     """
-    physics = resolve(physics)
     one_of("solver", solver, SOLVERS)
+    chosen = resolve(physics, model, readout)
     if model.na or model.nmocap:
         raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
     model = copy.copy(model)
     if solver == "fast":
         _cut_solver(model, fast_contacts)
     # Each engine's module is imported when it is first built: warp needs packages that the others do without.
-    if physics == "mujoco":
+    if chosen == "fused":
+        from .fused.cpu import NoLibrary
+        from .fused_engine import FusedEngine
+
+        try:
+            return FusedEngine(model, substeps, readout, threads, contacts)
+        except NoLibrary as error:
+            if physics != "auto":
+                raise TaskError(f"physics 'fused' {error}") from error
+            chosen = resolve("auto", model, readout)
+    if chosen == "mujoco":
         from .c_engine import CEngine
 
         return CEngine(model, substeps, readout, threads)
-    if physics == "warp":
+    if chosen == "warp":
         from .warp_engine import WarpEngine
 
         return WarpEngine(model, substeps, readout, contacts)

@@ -18,7 +18,7 @@ from ..versions import installed_version
 if TYPE_CHECKING:
     import mujoco  # at runtime after `check_versions`: a missing MuJoCo then gets its sentence
 
-ENGINES = ("mjx", "mujoco", "warp")
+ENGINES = ("fused", "mjx", "mujoco", "warp")
 MUJOCO_SERIES = "3.17"  # RK4, contact margins and MJX's private hooks differ between minor versions
 INSTALL = f"pip install 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
 
@@ -78,45 +78,85 @@ class Engine(Protocol):
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
           stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. The
           readout `overflow` is 1 if the step found no room for all contacts or constraints and is wrong, else 0: only
-          warp has buffers that can be too small without raising.
+          fused and warp have buffers that can be too small without raising.
         """
         ...
 
 
-def resolve(physics: str) -> str:
-    """The engine that `physics` means on this machine.
+def resolve(physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None) -> str:
+    """The engine that `physics` means on this machine, for a model and its readouts if they are given.
 
     Raises:
-      TaskError: no such engine, or it cannot run here.
+      TaskError: no such engine, or it cannot run here, or not with this model.
     """
     one_of("physics", physics, ("auto", *ENGINES))
     if physics == "auto":
-        return next(name for name in _PREFERENCE if obstacle(name) is None)
-    reason = obstacle(physics)
+        return next(name for name in _PREFERENCE if obstacle(name, model, readout) is None)
+    reason = obstacle(physics, model, readout)
     if reason is not None:
         raise TaskError(f"physics '{physics}' {reason}")
     return physics
 
 
-_PREFERENCE = ("mujoco", "warp", "mjx")  # the first that can run: the first two never can on the same device
+_PREFERENCE = ("fused", "mujoco", "warp", "mjx")  # the first that can run: the next two never can on the same device
 
 
-def obstacle(physics: str) -> str | None:
-    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can."""
+def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None) -> str | None:
+    """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can.
+
+    Only `fused` depends on the model and its readouts. Without a model, the answer is about the machine alone.
+    """
     device = jax.devices()[0]
+    if physics == "fused":
+        return _fused_obstacle(device, model, readout)
     if physics == "mujoco" and device.platform != "cpu":
         return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
     if physics == "warp":
-        if device.platform != "gpu" or "nvidia" not in device.device_kind.lower():
+        if not _is_nvidia(device):
             return f"needs an NVIDIA GPU; found {device.device_kind} (take 'mujoco' on CPUs, 'mjx' elsewhere)"
         if installed_version("warp-lang") is None:
             return "needs warp-lang; found none; install it with pip install 'pmt-jax[warp]'"
     return None
 
 
+def _fused_obstacle(device: jax.Device, model: mujoco.MjModel | None, readout: Readout | None) -> str | None:
+    on_cpu = device.platform == "cpu"
+    if not on_cpu and not _is_nvidia(device):
+        return f"runs on CPUs and NVIDIA GPUs; found {device.device_kind} (take 'mjx')"
+    reason = None if model is None else _refused(model, readout, on_cpu)
+    if reason:
+        return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
+    if on_cpu:
+        from .fused import cpu  # with its compilers, only if it is asked for
+
+        return cpu.obstacle()
+    from .fused import nvrtc
+
+    return nvrtc.obstacle()
+
+
+def _is_nvidia(device: jax.Device) -> bool:
+    return device.platform == "gpu" and "nvidia" in device.device_kind.lower()
+
+
+def _refused(model: mujoco.MjModel, readout: Readout | None, on_cpu: bool = True) -> str | None:
+    from .fused import model as tables_of
+    from .fused import threads
+
+    reason = tables_of.obstacle(model, readout)
+    return reason if reason or on_cpu else threads.obstacle(tables_of.tables(model, 1, readout or {}))
+
+
 def explain() -> dict[str, str | None]:
     """For each engine the obstacle to running it here, None if there is none."""
     return {name: obstacle(name) for name in ENGINES}
+
+
+def advice(model: mujoco.MjModel) -> str | None:
+    """What would make a model's steps faster on this machine, as a sentence; None if nothing is known."""
+    if obstacle("mujoco") or obstacle("fused") is None or _refused(model, None):
+        return None
+    return f"physics engine 'fused' steps this model more than ten times as fast, but it {obstacle('fused')}"
 
 
 def usable_cpus() -> int:

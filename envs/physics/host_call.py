@@ -37,25 +37,57 @@ def _struct(name: str, *fields: tuple[str, type]) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": [*header, *fields]})
 
 
-_List = _struct("XLA_FFI_Args", ("size", ctypes.c_int64), ("types", ctypes.c_void_p), ("items", ctypes.c_void_p))
-_Buffer = _struct(
-    "XLA_FFI_Buffer",
-    ("dtype", ctypes.c_int),
-    ("data", ctypes.c_void_p),
-    ("rank", ctypes.c_int64),
-    ("dims", ctypes.POINTER(ctypes.c_int64)),
-)
-_Frame = _struct(
-    "XLA_FFI_CallFrame",
-    ("api", ctypes.c_void_p),
-    ("context", ctypes.c_void_p),
-    ("stage", ctypes.c_int),
-    ("operands", _List),
-    ("results", _List),
-)
+class _Buffer(ctypes.Structure):  # XLA_FFI_Buffer
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("dtype", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("rank", ctypes.c_int64),
+        ("dims", ctypes.POINTER(ctypes.c_int64)),
+    ]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.dims[: self.rank])
+
+
+class _List(ctypes.Structure):  # XLA_FFI_Args, XLA_FFI_Rets
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("size", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+    ]
+
+    def buffers(self) -> list[_Buffer]:
+        return [self.items[k].contents for k in range(self.size)]
+
+
+class Frame(ctypes.Structure):
+    """XLA_FFI_CallFrame: what a handler gets. `operands` and `results` have `buffers()` with `data` and `shape`."""
+
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("api", ctypes.c_void_p),
+        ("context", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("operands", _List),
+        ("results", _List),
+    ]
+
+
 _Version = _struct("XLA_FFI_Api_Version", ("major", ctypes.c_int), ("minor", ctypes.c_int))
 _Error = _struct("XLA_FFI_Error_Create_Args", ("message", ctypes.c_char_p), ("code", ctypes.c_int))
-_Api = _struct("XLA_FFI_Api", ("version", _Version), ("internal", ctypes.c_void_p), ("create_error", ctypes.c_void_p))
+_Stream = _struct("XLA_FFI_Stream_Get_Args", ("context", ctypes.c_void_p), ("stream", ctypes.c_void_p))
+_Api = _struct(
+    "XLA_FFI_Api",
+    ("version", _Version),
+    ("internal", ctypes.c_void_p),
+    *((name, ctypes.c_void_p) for name in ("create_error", "error_message", "destroy_error", "register", "get_stream")),
+)
 
 
 class _Metadata(ctypes.Structure):
@@ -71,9 +103,10 @@ class _Extension(ctypes.Structure):
     ]
 
 
-_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
-_Entry = ctypes.PYFUNCTYPE(None, ctypes.POINTER(_Frame))
+_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(Frame))
+_Entry = ctypes.PYFUNCTYPE(None, ctypes.POINTER(Frame))
 _CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Error))
+_GetStream = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Stream))
 
 _names = itertools.count()
 _alive: list[Any] = []  # XLA keeps the addresses for the life of the process
@@ -85,11 +118,19 @@ class GivenUp(RuntimeError):
 
 
 def register(function: HostFunction) -> str:
-    """Makes `function` callable from compiled programs and returns the name to call it by.
+    """Makes `function` callable from compiled programs on CPUs and returns the name to call it by.
+
+    `function` runs on XLA's thread with the interpreter lock held, must fill its result and must not call JAX; what it
+    raises becomes the program's error, and its traceback goes to stderr.
+    """
+    return register_handler(lambda frame: function(_array(frame.operands), _array(frame.results)), "cpu")
+
+
+def register_handler(function: Callable[[Frame], None], platform: str) -> str:
+    """Like `register`, of a function of XLA's call frame, for programs on `platform` (cpu, CUDA).
 
     Names count up in the order of registration, so a program compiled in one process is found in the cache by the next
-    that registers in the same order. `function` runs on XLA's thread with the interpreter lock held, must fill its
-    result and must not call JAX; what it raises becomes the program's error, and its traceback goes to stderr.
+    that registers in the same order.
     """
 
     def handle(_: None, __: Any, arguments: tuple[Any, ...]) -> int | None:
@@ -99,7 +140,7 @@ def register(function: HostFunction) -> str:
             _arrived.discard(threading.get_ident())
             frame = arguments[0].contents
             if not (frame.extension and _describe(frame.extension)) and frame.stage == _EXECUTE:
-                function(_array(frame.operands), _array(frame.results))
+                function(frame)
             return None
         except BaseException as error:
             return _error(arguments[0].contents.api, error)
@@ -112,8 +153,17 @@ def register(function: HostFunction) -> str:
     handler = _Handler(entry)
     name = f"pmt_host_call_{next(_names)}"
     _alive.append(handler)
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform=platform)
     return name
+
+
+def stream_of(frame: Frame) -> int:
+    """The CUDA stream that a program on a GPU calls from."""
+    arguments = _Stream(ctypes.sizeof(_Stream), None, frame.context, None)
+    failed = _GetStream(_Api.from_address(frame.api).get_stream)(ctypes.byref(arguments))
+    if failed:
+        raise RuntimeError("XLA gives no stream")
+    return arguments.stream or 0
 
 
 def host_call(name: str, operand: jax.Array, width: int) -> jax.Array:
@@ -133,11 +183,10 @@ def _describe(extension_address: int) -> bool:
     return True
 
 
-def _array(buffers: ctypes.Structure) -> np.ndarray:
+def _array(buffers: _List) -> np.ndarray:
     """The first of XLA's buffers as an array that shares its memory."""
-    address = ctypes.c_void_p.from_address(buffers.items).value  # pyright: ignore[reportAttributeAccessIssue]
-    buffer = _Buffer.from_address(address)  # pyright: ignore[reportArgumentType]
-    shape, dtype = tuple(buffer.dims[: buffer.rank]), _DTYPES[buffer.dtype]
+    buffer = buffers.buffers()[0]
+    shape, dtype = buffer.shape, _DTYPES[buffer.dtype]
     size = math.prod(shape) * dtype.itemsize
     if size == 0:
         return np.empty(shape, dtype)

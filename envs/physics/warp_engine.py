@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from . import warp_kernels
+from .batching import flattened
 from .contract import PhysicsState, Readout, needs_post_constraint, rest_state
 from .mjx_patches import import_mjx
 
@@ -52,7 +53,7 @@ class WarpEngine:
         # simulated anyway.
         ctrl = jnp.clip(ctrl, -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
         single = jax.tree.map(lambda x: x[None], (state, ctrl))
-        return jax.tree.map(lambda x: x[0], _flattened(self._step_all)(*single))
+        return jax.tree.map(lambda x: x[0], flattened(self._step_all)(*single))
 
     def _step_all(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
         """One control step of a batch: all arrays have a leading [B]."""
@@ -159,26 +160,6 @@ def _quieten() -> None:
 
     asked = logging.getLogger(__name__).isEnabledFor(logging.INFO)
     warp.config.log_level = warp.LOG_INFO if asked else warp.LOG_WARNING
-
-
-def _flattened(batched: Any) -> Any:
-    """A function of arrays with a leading [B] for which `vmap`, however nested, only makes B larger."""
-
-    @jax.custom_batching.custom_vmap
-    def call(*args: Any) -> Any:
-        return batched(*args)
-
-    @call.def_vmap
-    def rule(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
-        def spread(leaf: jax.Array, is_batched: bool) -> jax.Array:
-            leaf = leaf if is_batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
-            return leaf.reshape(-1, *leaf.shape[2:])
-
-        out = _flattened(batched)(*jax.tree.map(spread, args, tuple(in_batched)))
-        out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
-
-    return call
 
 
 _MOST_CONTACTS = 64  # of one world; 30 were enough for the ant, 60 for two hands

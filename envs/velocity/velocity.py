@@ -85,9 +85,9 @@ class Velocity:
       fall_cost: adds a second cost, 1 where the episode ends by the robot's rule of health; limit 0.1.
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
         keep running moments).
-      physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
+      physics: `auto`, `fused`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
       solver: `converged`, or `fast` (fewer solver iterations).
-      threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
+      threads: of `fused` and `mujoco`, which the devices of a process share; all usable CPUs if None.
     """
 
     shares_cost = True

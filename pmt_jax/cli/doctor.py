@@ -126,7 +126,12 @@ def _engines() -> Iterator[Finding]:
         yield Finding("bad", "physics engines", str(error))
         return
     for name, obstacle in obstacles.items():
-        usable = "usable" + (", and what physics = auto takes" if name == chosen else "")
+        usable = "usable"
+        if name == chosen:
+            where = " for the models that it can step" if name == "fused" else ""
+            usable += f", and what physics = auto takes{where}"
+        if name == "fused" and not obstacle:
+            usable += f"; {tasks.compiler()}"
         yield Finding("no", f"engine {name}", obstacle) if obstacle else Finding("ok", f"engine {name}", usable)
 
 

@@ -45,7 +45,7 @@ def _describe(name: str) -> int:
         "observation": f"{spec.obs_dim} numbers an agent; global state {spec.state_dim}",
         "costs": f"{spec.num_costs} an agent; limit {Limits.of_task(spec)} an episode",
         "horizon": f"{spec.horizon} control steps",
-        "engines": _engines(env.engine),
+        "engines": _engines(env),
         "settings": ", ".join(known for known in (name, f"paper/{name}") if known in load.names()) or "the defaults",
     }
     result(f"{name}: {load.about(name) or 'a task of your own'}")
@@ -59,9 +59,10 @@ def _describe(name: str) -> int:
     return 0
 
 
-def _engines(engine: str) -> str:
+def _engines(env: tasks.Env) -> str:
     """Which engines can simulate a task here, and why others cannot."""
-    if engine == "xla":
+    if env.engine == "xla":
         return "none: the task is plain JAX"
-    _, obstacles = tasks.engines()
-    return "; ".join(f"{name}: {why}" if why else name for name, why in obstacles.items()) + f"; auto takes {engine}"
+    _, obstacles = tasks.engines(env)
+    listing = "; ".join(f"{name}: {why}" if why else name for name, why in obstacles.items())
+    return f"{listing}; auto takes {env.engine}"

@@ -275,7 +275,7 @@ class Config(Hyper):
         "trust-region steps of MACPO per update, each on its part of the batch; 0 means as many as minibatches",
         COUNT,
     )
-    physics: Literal["auto", "mjx", "warp", "mujoco"] = simulation(
+    physics: Literal["auto", "fused", "mjx", "warp", "mujoco"] = simulation(
         "auto", "simulation engine; auto takes the fastest for the device"
     )
     env: tuple[tuple[str, Any], ...] = simulation((), "the task's own options (pmt envs TASK lists them)")

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import tasks
 from ..config import load
 from ..config.settings import Config
 from ..errors import UsageError
@@ -91,7 +92,8 @@ def train(
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, claims.release_all))
-        setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
+        with tasks.announcing(say):
+            setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
         folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
         folder.claim(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
@@ -152,6 +154,9 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
         seeds = f"{config.seeds} runs, seeds {setup.trials.seed.min()} to {setup.trials.seed.max()}"
     say(f"pmt: {config.method} on {config.task}, {seeds}, into {out}")
     say(f"device {device.device_kind} ({device.platform}{threads}), physics engine {setup.vector.env.engine}")
+    advice = tasks.advice(setup.vector.env) if config.physics == "auto" else None
+    if advice:
+        say(advice)
     if setup.mesh:
         seeds, environments = setup.mesh.devices.shape
         say(

@@ -92,7 +92,7 @@ def test_words_of_a_command_line_become_typed():
         ({"cost_limit": -2}, "cost_limit must be a cost per episode of at least 0"),
         ({"hidden": ()}, "hidden must name at least one layer"),
         ({"seed": -1}, "seed must lie between"),
-        ({"physics": "mujocco"}, "expected auto | mjx | warp | mujoco"),
+        ({"physics": "mujocco"}, "expected auto | fused | mjx | warp | mujoco"),
     ],
 )
 def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):

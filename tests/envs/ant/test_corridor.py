@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import envs
 from envs.ant import corridor, walls
 from envs.errors import TaskError
+from native import compiled
 from places import DATA
 
 TOLERANCE = {"qpos": 5e-5, "qvel": 5e-3, "reward_contact": 1e-5, "reward": 2e-3, "torso_xpos": 5e-5}
@@ -52,7 +53,10 @@ def worst(actual, expected) -> float:
     return float(np.abs(np.asarray(actual, np.float64) - expected).max())
 
 
-@pytest.fixture(scope="session", params=["mujoco", pytest.param("mjx", marks=pytest.mark.full)])
+@pytest.fixture(
+    scope="session",
+    params=["mujoco", pytest.param("fused", marks=compiled), pytest.param("mjx", marks=pytest.mark.full)],
+)
 def replay(request):
     """Recording and our State after one control step from each of its rows."""
     rows = recording("ant_2x4")

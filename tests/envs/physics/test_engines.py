@@ -16,9 +16,10 @@ import pytest
 
 import envs
 from envs import physics
-from envs.ant import corridor
+from envs.ant import corridor, walls
 from envs.errors import TaskError
-from envs.physics import contract, mjx_patches, thread_team, warp_engine
+from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
+from envs.physics.fused import nvrtc
 from places import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
@@ -350,7 +351,7 @@ def test_warp_without_a_gpu_is_one_sentence():
     with pytest.raises(TaskError, match="physics 'warp' needs an NVIDIA GPU; found cpu"):
         engine(physics="warp")
     assert physics.explain()["mujoco"] is None and physics.explain()["warp"] is not None
-    assert physics.resolve("auto") == "mujoco"
+    assert physics.resolve("auto") == ("mujoco" if physics.obstacle("fused") else "fused")
 
 
 def test_warp_without_its_package_is_one_sentence(monkeypatch):
@@ -361,9 +362,37 @@ def test_warp_without_its_package_is_one_sentence(monkeypatch):
     monkeypatch.setattr(contract, "installed_version", lambda _: None)
     with pytest.raises(TaskError, match=r"needs warp-lang; found none; install it with pip install 'pmt-jax\[warp\]'"):
         physics.resolve("warp")
+    monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
+    assert physics.resolve("auto") == "fused"
+    monkeypatch.setattr(nvrtc, "obstacle", lambda: "needs NVIDIA's run-time compiler")
     assert physics.resolve("auto") == "mjx"
+    with pytest.raises(TaskError, match="'fused' needs NVIDIA's run-time compiler"):
+        physics.resolve("fused")
     with pytest.raises(TaskError, match="runs on CPUs only"):
         physics.resolve("mujoco")
+
+
+def test_fused_on_another_accelerator_is_one_sentence(monkeypatch):
+    class Gpu:
+        platform, device_kind = "gpu", "AMD Instinct MI300X"
+
+    monkeypatch.setattr(jax, "devices", lambda: [Gpu])
+    with pytest.raises(TaskError, match="'fused' runs on CPUs and NVIDIA GPUs; found AMD"):
+        physics.resolve("fused")
+    assert physics.resolve("auto") == "mjx"
+
+
+def test_on_a_gpu_warp_takes_what_fused_cannot_step(monkeypatch):
+    class Gpu:
+        platform, device_kind = "gpu", "NVIDIA H100"
+
+    monkeypatch.setattr(jax, "devices", lambda: [Gpu])
+    monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
+    monkeypatch.setattr(contract, "installed_version", lambda _: "1.18")
+    assert physics.resolve("auto", walls.model()) == "fused"
+    assert physics.resolve("auto", walls.model("solid")) == "warp"
+    with pytest.raises(TaskError, match=r"cannot step this model: .* \(take 'warp'\)"):
+        physics.resolve("fused", walls.model("solid"))
 
 
 def test_room_for_contacts_in_warp():
@@ -371,7 +400,7 @@ def test_room_for_contacts_in_warp():
 
 
 def test_flattened_turns_any_vmap_into_one_batch():
-    doubled = warp_engine._flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+    doubled = batching.flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
 
     def lone(x, y):
         return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))

@@ -144,7 +144,7 @@ def test_ctrl_c_on_the_way_in_is_an_error():
         raise KeyboardInterrupt
 
     api = host_call._Api(create_error=ctypes.cast(create_error, ctypes.c_void_p))
-    frame = ctypes.pointer(host_call._Frame(api=ctypes.addressof(api)))
+    frame = ctypes.pointer(host_call.Frame(api=ctypes.addressof(api)))
     assert handler(frame) is None
     send, before = ctypes.CDLL(None)["raise"], signal.signal(signal.SIGUSR1, strike)
     gc.disable()  # it may call Python, of hypothesis for example, which the signal would strike instead
@@ -271,5 +271,5 @@ def test_xla_accepts_the_abi_we_speak():
 
 
 def test_structures_are_laid_out_as_in_the_header():
-    sizes = {name: ctypes.sizeof(getattr(host_call, name)) for name in ("_Buffer", "_List", "_Frame", "_Version")}
-    assert sizes == {"_Buffer": 48, "_List": 40, "_Frame": 128 - 8, "_Version": 24}
+    sizes = {name: ctypes.sizeof(getattr(host_call, name)) for name in ("_Buffer", "_List", "Frame", "_Version")}
+    assert sizes == {"_Buffer": 48, "_List": 40, "Frame": 128 - 8, "_Version": 24}

@@ -14,13 +14,14 @@ import envs
 from envs.errors import TaskError
 from envs.vector import VectorEnv
 from envs.velocity import VARIANTS, robots
+from native import compiled
 from places import DATA
 
 NAMES = [f"velocity_{variant}" for variant in VARIANTS]
 PLACES = ("torso_xpos", "com")  # what `restore` takes beside qpos, of the robots that have it
 # engine -> largest error of qpos, qvel, reward, obs; share of rows that may be over
 TOLERANCES = {"mujoco": (2e-5, 5e-4, 5e-4, 1e-3, 0.002), "mjx": (5e-5, 5e-3, 1e-3, 2e-3, 0.01)}
-TOLERANCES["warp"] = TOLERANCES["mujoco"]
+TOLERANCES["fused"] = TOLERANCES["warp"] = TOLERANCES["mujoco"]
 EDGE = 1e-4  # m/s to the threshold, within which float32 may decide either way
 PARTITIONED = {"velocity_ant_4x2", "velocity_half_cheetah_6x1"}  # the robots of other tasks, shared out otherwise
 
@@ -77,6 +78,12 @@ def check_replay(name: str, physics: str) -> None:
 @each()
 def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
+
+
+@compiled
+@each()
+def test_reproduces_the_recorded_steps_on_fused(name):
+    check_replay(name, "fused")
 
 
 # MJX compiles a robot for up to a minute: the one in a fluid in .ci/run, the others by hand. Contacts on MJX are those

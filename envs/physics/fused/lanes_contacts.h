@@ -1,0 +1,168 @@
+// Contacts and limits: which some world has, their Jacobians, and their residuals at the warm start.
+#pragma once
+#include "lanes_state.h"
+
+// Keeps a world's contacts within its room, and reports where it had too little.
+FUNCTION Mask admitted(Worlds& w, Mask has) {
+  if constexpr (MOST_CONTACTS < CANDIDATES) {
+    w.contacts += select(has, Num(1), Num(0));
+    const Mask over = has & (w.contacts > Num(MOST_CONTACTS));
+    w.overflow = select(over, Num(1), w.overflow);
+    return has & !over;
+  }
+  return has;
+}
+
+FUNCTION Vec3 of_body(const Worlds& w, int b, const Real* place) {
+  return HAS_FREE && b == 0 ? vec(place) : w.turn[b] * vec(place) + w.place[b];
+}
+FUNCTION Vec3 turned_with_body(const Worlds& w, int b, const Real* axis) {
+  return HAS_FREE && b == 0 ? vec(axis) : w.turn[b] * vec(axis);
+}
+
+FUNCTION Frame frame_of(Vec3 place, Vec3 normal, Vec3 tangent, Real friction) {
+  return {place, {normal, tangent * Num(friction), cross(normal, tangent) * Num(friction)}};
+}
+
+// The weight of an edge and the contact's residuals, J (a + B v) + K imp position (engine_core_constraint.c,
+// mj_makeImpedance and mj_referenceConstraint).
+FUNCTION void finish_slot(Worlds& w, Slot& s, Mask has, Num distance, const ContactRow& contact) {
+  const ImpedanceRow& row = contact.impedance;
+  const Num position = distance - Num(contact.margin);
+  const Num imp = impedance(position, Num(row.lowest), Num(row.highest), Num(row.inverse_width));
+  for (int x = 0; x < 3; ++x) s.residual[x] = s.change[x] = Num(0);
+  for (int k = 0; k < s.columns; ++k) {
+    const int d = s.dofs[k];
+    const Num wanted = w.a[d] + Num(row.damping) * w.velocity[d];
+    for (int x = 0; x < 3; ++x) s.residual[x] += s.jacobian[k][x] * wanted;
+  }
+  s.residual[0] += Num(row.stiffness) * imp * position;
+  s.has = has;
+  s.weight = select(has, imp * inverse(Num(contact.regularisation) * (Num(1) - imp)), Num(0));
+}
+
+FUNCTION void joint_columns(const Worlds& w, Slot& s, const Frame& frame, int from, const Real* signs) {
+  Vec3 moments[3];
+  for (int x = 0; x < 3; ++x) moments[x] = cross(frame.place, frame.axes[x]);
+  for (int k = from; k < s.columns; ++k) {
+    const Vec3 spin = w.axis_spin[s.dofs[k]], move = w.axis_move[s.dofs[k]];
+    for (int x = 0; x < 3; ++x) {
+      const Num entry = dot(spin, moments[x]) + dot(move, frame.axes[x]);
+      s.jacobian[k][x] = signs ? Num(signs[k]) * entry : entry;
+    }
+  }
+}
+
+FUNCTION void root_columns(Slot& s, const Frame& frame) {
+  for (int x = 0; x < 3; ++x) {
+    const Vec3 axis = frame.axes[x], moment = cross(frame.place, axis);
+    s.jacobian[0][x] = axis.x, s.jacobian[1][x] = axis.y, s.jacobian[2][x] = axis.z;
+    s.jacobian[3][x] = moment.x, s.jacobian[4][x] = moment.y, s.jacobian[5][x] = moment.z;
+  }
+}
+
+FUNCTION void floor_contacts(Worlds& w) {
+  for (int c = 0; c < NPOINTS; ++c) {
+    const PointRow& point = POINTS[c];
+    const int b = point.body;
+    const Vec3 up = w.world.up, centre = of_body(w, b, point.centre);
+    const Num radius = Num(point.radius);
+    const Num distance = dot(up, centre) + w.height - Num(point.height) - radius;
+    Mask has = distance <= Num(point.contact.margin);
+    if (!any(has)) continue;
+    has = admitted(w, has);
+    const Vec3 first = point.capsule ? tangent(w.world, up, turned_with_body(w, b, point.axis)) : w.world.y;
+    const Vec3 place = centre - up * (radius + Num(Real(.5)) * distance);
+    const Frame frame = frame_of(place, up, first, point.contact.friction);
+    Slot& s = w.slots[w.slot_count++];
+    s.dofs = CHAINS[b], s.columns = NCHAINS[b], s.place1 = 0, s.place2 = point.place;
+    if constexpr (HAS_FREE) root_columns(s, frame);
+    joint_columns(w, s, frame, FIRST, nullptr);
+    if constexpr (READS_FORCES) s.frame = frame;
+    finish_slot(w, s, has, distance, point.contact);
+  }
+}
+
+FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num second, Mask wanted) {
+  const PairRow& pair = PAIRS[c];
+  const SegmentRow &one = SEGMENTS[pair.first], &two = SEGMENTS[pair.second];
+  const Vec3 on_first = s.middle1 + s.half1 * first, apart = s.middle2 + s.half2 * second - on_first;
+  const Num length = root(dot(apart, apart));
+  Num distance = length - Num(one.radius + two.radius);
+  Mask has = wanted & (distance <= Num(pair.contact.margin));
+  if (!any(has)) return;
+  has = admitted(w, has);
+  // A world without this contact must not see NaN: 0 * NaN would stay.
+  distance = select(has, distance, Num(0));
+  const Vec3 side1 = turned_with_body(w, one.body, one.side), side2 = turned_with_body(w, two.body, two.side);
+  const Vec3 normal = select(has, normal_between(w.world, apart, length, side1, side2), w.world.x);
+  const Vec3 surface = normal * (Num(one.radius) + Num(Real(.5)) * distance);
+  const Vec3 place = select(has, on_first + surface, vec(0, 0, 0));
+  const Frame frame = frame_of(place, normal, tangent(w.world, normal), pair.contact.friction);
+  Slot& slot = w.slots[w.slot_count++];
+  slot.dofs = PAIR_DOFS[c], slot.columns = pair.columns, slot.place1 = one.place, slot.place2 = two.place;
+  joint_columns(w, slot, frame, 0, PAIR_SIGNS[c]);
+  if constexpr (READS_FORCES) slot.frame = frame;
+  finish_slot(w, slot, has, distance, pair.contact);
+  if constexpr (FILLS) {
+    unsigned all = 0;
+    for (int k = 0; k < pair.columns; ++k) all |= 1u << PAIR_DOFS[c][k];
+    for (int k = 0; k < pair.columns; ++k) w.pattern[PAIR_DOFS[c][k]] |= all & ((1u << PAIR_DOFS[c][k]) - 1);
+  }
+}
+
+FUNCTION void pair_contacts(Worlds& w) {
+  Vec3 middles[at_least_one(NSEGMENTS)], halves[at_least_one(NSEGMENTS)];
+  for (int g = 0; g < NSEGMENTS; ++g) {
+    middles[g] = of_body(w, SEGMENTS[g].body, SEGMENTS[g].centre);
+    halves[g] = turned_with_body(w, SEGMENTS[g].body, SEGMENTS[g].half);
+  }
+  for (int c = 0; c < NPAIRS; ++c) {
+    const PairRow& pair = PAIRS[c];
+    const int one = pair.first, two = pair.second;
+    const Vec3 apart = middles[one] - middles[two];
+    if (!any(dot(apart, apart) <= Num(pair.reach * pair.reach * Real(1.0001)))) continue;
+    const Segments s = {middles[one], middles[two], halves[one], halves[two]};
+    const Num none = dot(w.world.up, w.world.up) * Num(0);
+    Nearest nearest = {none, none, mask_of(false), none, none};
+    if (SEGMENTS[one].capsule) nearest = nearest_of_capsules(s);
+    else if (SEGMENTS[two].capsule) nearest = nearest_of_sphere_and_capsule(s);
+    pair_contact(w, c, s, nearest.first, nearest.second, mask_of(true));
+    if (any(nearest.two)) pair_contact(w, c, s, nearest.first_again, nearest.second_again, nearest.two);
+  }
+}
+
+FUNCTION void limits(Worlds& w) {
+  w.limit_count = 0;
+  for (int k = 0; k < NLIMITS; ++k) {
+    const LimitRow& limit = LIMITS[k];
+    const Num qpos = w.qpos[limit.qpos], above = qpos - Num(limit.low), below = Num(limit.high) - qpos;
+    const Mask low = above < below;
+    const Num position = select(low, above, below) - Num(limit.margin);
+    const Mask beyond = position < Num(0);
+    if (!any(beyond)) continue;
+    w.limits[w.limit_count++] = k;
+    const ImpedanceRow& row = limit.impedance;
+    const Num sign = select(low, Num(1), Num(-1));
+    const Num imp = impedance(position, Num(row.lowest), Num(row.highest), Num(row.inverse_width));
+    const Num wanted = w.a[limit.dof] + Num(row.damping) * w.velocity[limit.dof];
+    const Num residual = sign * wanted + Num(row.stiffness) * imp * position;
+    w.limit_sign[k] = select(beyond, sign, Num(0));
+    w.limit_weight[k] = select(beyond, imp * inverse(Num(limit.inverse_weight) * (Num(1) - imp)), Num(0));
+    w.limit_residual[k] = select(beyond, residual, Num(0));
+  }
+}
+
+FUNCTION void find_constraints(Worlds& w) {
+  w.slot_count = 0;
+  w.contacts = Num(0);
+  if constexpr (FILLS) {
+    for (int i = 0; i < NV; ++i) {
+      w.pattern[i] = 0;
+      for (int k = 0; k < NANCESTORS[i]; ++k) w.pattern[i] |= 1u << ANCESTORS[i][k];
+    }
+  }
+  floor_contacts(w);
+  if constexpr (NPAIRS > 0) pair_contacts(w);
+  limits(w);
+}

@@ -1,0 +1,357 @@
+// What touches, and the rows of contacts and limits; see threads.h.
+#pragma once
+#include "threads_smooth.h"
+
+// A lane's contact: its four edges are normal +- first, normal +- second; the tangents' Jacobians are times friction.
+struct Contact {
+  bool exists;
+  int candidate;
+  real weight;             // D of an edge
+  real normal, first, second;     // J a - aref
+  real d_normal, d_first, d_second;  // its change along the step
+  unsigned dofs;           // those that move the two bodies apart
+  unsigned active;         // edges
+};
+
+struct Limit {
+  real weight, residual, change, sign;
+};
+
+struct Touch {
+  Vec point, normal, tangent;
+  real distance;
+};
+
+DEVICE real impedance_at(real violation, real lowest, real highest, real inverse_width) {
+  const real x = absolute(violation) * inverse_width;
+  if (x >= real(1)) return highest;
+  const real y = x <= real(0.5) ? real(2) * x * x : real(1) - real(2) * (real(1) - x) * (real(1) - x);
+  return lowest + y * (highest - lowest);
+}
+
+DEVICE Vec world_up(const World& w) { return FREE ? vec_at(w.base + 6) : vec(0, 0, 1); }
+DEVICE Vec world_side(const World& w) { return FREE ? vec_at(w.base + 3) : vec(0, 1, 0); }
+
+// A point over the floor. mjc_PlaneSphere, mjc_PlaneCapsule: a capsule's axis is the first tangent.
+DEVICE bool touches_floor(const World& w, int point, Touch& touch) {
+  const real* pose = w.pose[point_body(point)];
+  const Mat R = mat_at(pose);
+  const Vec up = world_up(w), centre = mul(R, point_centre(point)) + vec_at(pose + 9);
+  const real height = (FREE ? w.qpos[2] : real(0)) - point_height(point);
+  touch.distance = dot(up, centre) + height - point_radius(point);
+  if (!(touch.distance <= contact_margin(point))) return false;
+  touch.normal = up;
+  touch.point = centre - up * (point_radius(point) + real(0.5) * touch.distance);
+  touch.tangent = point_round(point) ? world_side(w) : mul(R, point_axis(point));
+  return true;
+}
+
+#if PAIRS > 0
+// Where two segments come nearest: centre + half * x of each, |x| <= 1 (mjraw_CapsuleCapsule, mjraw_SphereCapsule).
+struct Nearest {
+  bool touches;
+  Vec from, to;
+};
+
+DEVICE Nearest nearest(Vec a, Vec half_a, real x, Vec b, Vec half_b, real y, real reach) {
+  const Vec from = a + half_a * x, to = b + half_b * y, gap = to - from;
+  return {dot(gap, gap) <= reach * reach, from, to};
+}
+
+// Parallel capsules may touch at both ends of where they lie side by side: the lower along the first, then the upper.
+DEVICE Nearest nearest_parallel(Vec a, Vec half_a, Vec b, Vec half_b, const real (&c)[5], real reach, int which) {
+  const real aa = c[0], ab = c[1], bb = c[2], u = c[3], v = c[4];
+  const real end = (which == 0) == (ab <= 0) ? real(-1) : real(1);  // of the second
+  const real along = (u - end * ab) / aa, x = clamped(along, -1, 1);
+  const real y = x == along ? end : clamped((v - x * ab) / bb, -1, 1);
+  return nearest(a, half_a, x, b, half_b, y, reach);
+}
+
+DEVICE Nearest nearest_of(Vec a, Vec half_a, Vec b, Vec half_b, real reach, int which) {
+  const Vec between = a - b;
+  const real aa = dot(half_a, half_a), ab = -dot(half_a, half_b), bb = dot(half_b, half_b);
+  const real u = -dot(half_a, between), v = dot(half_b, between);
+  if (aa == 0 || bb == 0) {
+    const real x = aa > 0 ? clamped(u / aa, -1, 1) : real(0);
+    const real y = bb > 0 ? clamped(v / bb, -1, 1) : real(0);
+    Nearest found = nearest(a, half_a, x, b, half_b, y, reach);
+    found.touches = found.touches && which == 0;
+    return found;
+  }
+  // By products that do not cancel: aa bb - ab ab, and so on.
+  const Vec across = cross(half_a, half_b);
+  const real det = dot(across, across);
+  if (!(det > PARALLEL * aa * bb)) {
+    const real c[5] = {aa, ab, bb, u, v};
+    return nearest_parallel(a, half_a, b, half_b, c, reach, which);
+  }
+  real x = dot(across, cross(half_b, between)) / det, y = dot(across, cross(half_a, between)) / det;
+  if (x > 1) {
+    x = 1;
+    y = (v - ab) / bb;
+  } else if (x < -1) {
+    x = -1;
+    y = (v + ab) / bb;
+  }
+  if (y > 1) {
+    y = 1;
+    x = clamped((u - ab) / aa, -1, 1);
+  } else if (y < -1) {
+    y = -1;
+    x = clamped((u + ab) / aa, -1, 1);
+  }
+  Nearest found = nearest(a, half_a, x, b, half_b, y, reach);
+  found.touches = found.touches && which == 0;
+  return found;
+}
+
+// A lane a segment: where it is.
+DEVICE void place_segments(World& w) {
+  EACH_LANE {
+    for (int k = lane; k < SEGMENTS; k += LANES) {
+      const real* pose = w.pose[segment_body(k)];
+      const Mat R = mat_at(pose);
+      put(w.segment[k], mul(R, segment_centre(k)) + vec_at(pose + 9));
+      put(w.segment[k] + 3, mul(R, segment_half(k)));
+    }
+  }
+  MEET();
+}
+
+// Lists the pairs whose bounding spheres touch, and returns how many.
+DEVICE int list_near(World& w) {
+  int found = 0;
+  ROLLED for (int start = 0; start < PAIRS; start += LANES) {
+    PerLane<bool> near;
+    EACH_LANE {
+      const int pair = start + lane;
+      near[ME] = false;
+      if (pair < PAIRS) {
+        const unsigned segments = pair_segments(pair);
+        const Vec between = vec_at(w.segment[segments & 255]) - vec_at(w.segment[segments >> 8]);
+        near[ME] = dot(between, between) <= pair_far(pair);
+      }
+    }
+    const unsigned hits = ballot(near);
+    EACH_LANE if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
+    found += count(hits);
+  }
+  MEET();
+  return found;
+}
+
+// mjraw_SphereSphere at the nearest places. Segments that cross have no normal: MuJoCo takes a product of two axes.
+DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
+  const unsigned segments = pair_segments(pair);
+  const int first = segments & 255, second = segments >> 8;
+  const real radii = segment_radius(first) + segment_radius(second), reach = radii + contact_margin(POINTS + pair);
+  const Nearest found = nearest_of(vec_at(w.segment[first]), vec_at(w.segment[first] + 3), vec_at(w.segment[second]),
+                                   vec_at(w.segment[second] + 3), reach, which);
+  if (!found.touches) return false;
+  const Vec gap = found.to - found.from;
+  const real length = root(dot(gap, gap));
+  Vec normal = gap * (real(1) / length);
+  if (length < CROSSING) {
+    normal = cross(mul(mat_at(w.pose[segment_body(first)]), segment_side(first)),
+                   mul(mat_at(w.pose[segment_body(second)]), segment_side(second)));
+    const real size = root(dot(normal, normal));
+    normal = size < real(1e-15) ? vec(1, 0, 0) : normal * (real(1) / size);
+  }
+  const Vec side = world_side(w);
+  touch.distance = length - radii;
+  touch.normal = normal;
+  touch.point = found.from + normal * (segment_radius(first) + real(0.5) * touch.distance);
+  touch.tangent = absolute(dot(side, normal)) < real(0.5) ? side : world_up(w);
+  return true;
+}
+#endif
+
+#if OWN_SLOTS
+// Contacts in slots: each point has its own, its lane's. Returns how many there are.
+DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>& touch) {
+  PerLane<bool> hit;
+  EACH_LANE {
+    hit[ME] = lane < POINTS && touches_floor(w, lane, touch[ME]);
+    contacts[ME].exists = hit[ME];
+    contacts[ME].candidate = lane;
+  }
+  return count(ballot(hit));
+}
+#else
+// Puts what touches into the next free slots, in the order of the lanes. Returns how many there are then.
+DEVICE int take(World& w, const PerLane<bool>& hit, const PerLane<int>& candidate, const PerLane<Touch>& touch,
+                int found) {
+  const unsigned hits = ballot(hit);
+  EACH_LANE {
+    const int slot = found + count(hits & ((1u << lane) - 1u));
+    if (hit[ME] && slot < SLOTS) {
+      real* to = w.contact[slot];
+      put(to, touch[ME].point);
+      put(to + 3, touch[ME].normal);
+      put(to + 6, touch[ME].tangent);
+      to[9] = touch[ME].distance;
+      w.candidate[slot] = candidate[ME];
+    }
+  }
+  return found + count(hits);
+}
+
+// Contacts in slots, a lane's each: points, then pairs. Returns how many there are, those without a slot among them.
+DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>& touch) {
+  PerLane<bool> hit;
+  PerLane<int> candidate;
+  int found = 0;
+  ROLLED for (int start = 0; start < POINTS; start += LANES) {
+    EACH_LANE {
+      candidate[ME] = start + lane;
+      hit[ME] = start + lane < POINTS && touches_floor(w, start + lane, touch[ME]);
+    }
+    found = take(w, hit, candidate, touch, found);
+  }
+#if PAIRS > 0
+  place_segments(w);
+  const int near = list_near(w);  // parallel capsules touch twice
+  ROLLED for (int start = 0; start < 2 * near; start += LANES) {
+    EACH_LANE {
+      const int item = start + lane, pair = item < 2 * near ? w.near[item >> 1] : 0;
+      candidate[ME] = POINTS + pair;
+      hit[ME] = item < 2 * near && touches_pair(w, pair, item & 1, touch[ME]);
+    }
+    found = take(w, hit, candidate, touch, found);
+  }
+#endif
+  MEET();
+  EACH_LANE {
+    contacts[ME].exists = lane < found && lane < SLOTS;
+    if (contacts[ME].exists) {
+      const real* from = w.contact[lane];
+      touch[ME] = {vec_at(from), vec_at(from + 3), vec_at(from + 6), from[9]};
+      contacts[ME].candidate = w.candidate[lane];
+    }
+  }
+  return found;
+}
+#endif
+
+// A column of a contact's Jacobian: how fast a dof moves the bodies apart along the normal and the scaled tangents.
+struct Directions {
+  Vec normal, first, second;              // forces
+  Vec normal_turn, first_turn, second_turn;  // their moments about the base's origin
+};
+
+DEVICE void put_column(World& w, int slot, int column, const real (&row)[3], real rate, Contact& contact) {
+  put_four(w.J + slot * J_WIDTH + 4 * column, row[0], row[1], row[2]);
+  contact.normal += row[0] * rate;
+  contact.first += row[1] * rate;
+  contact.second += row[2] * rate;
+}
+
+// The columns of the dofs that move the contact, in their order.
+DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, Contact& contact) {
+  int column = 0;
+#if FREE
+  if (contact.dofs & 1u) {
+    const Vec n[2] = {d.normal, d.normal_turn}, t[2] = {d.first, d.first_turn}, u[2] = {d.second, d.second_turn};
+    UNROLLED for (int k = 0; k < 6; ++k) {
+      const Vec a = n[k / 3], b = t[k / 3], c = u[k / 3];
+      const int axis = k % 3;
+      const real row[3] = {axis == 0 ? a.x : axis == 1 ? a.y : a.z, axis == 0 ? b.x : axis == 1 ? b.y : b.z,
+                           axis == 0 ? c.x : axis == 1 ? c.y : c.z};
+      put_column(w, slot, k, row, w.acceleration[k] + damping * w.velocity[k], contact);
+    }
+    column = 6;
+  }
+#endif
+#if PAIRS > 0
+  const unsigned opposite = contact_opposite(contact.candidate);
+#endif
+  for (unsigned dofs = contact.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) {
+    const int dof = lowest(dofs);
+    const Vec angular = vec_at(w.axis[dof]), linear = vec_at(w.axis[dof] + 3);
+    real row[3] = {dot(angular, d.normal_turn) + dot(linear, d.normal),
+                   dot(angular, d.first_turn) + dot(linear, d.first),
+                   dot(angular, d.second_turn) + dot(linear, d.second)};
+#if PAIRS > 0
+    if (opposite >> dof & 1u) {
+      UNROLLED for (int k = 0; k < 3; ++k) row[k] = -row[k];
+    }
+#endif
+    put_column(w, slot, column++, row, w.acceleration[dof] + damping * w.velocity[dof], contact);
+  }
+}
+
+// The column of a dof in a contact's Jacobian.
+DEVICE int column_of(const World& w, int slot, int dof) {
+#if OWN_SLOTS
+  return dof_column(dof);
+#else
+  return count(w.moved[slot] & ((1u << dof) - 1u));
+#endif
+}
+
+// The first tangent times friction (mju_makeFrame).
+DEVICE Vec first_tangent(const Touch& touch, int candidate) {
+  const Vec t = touch.tangent - touch.normal * dot(touch.normal, touch.tangent);
+  return t * (contact_friction(candidate) * inverse_root(dot(t, t) + real(1e-30)));
+}
+
+// A lane's contact: its Jacobian, its weight (mj_makeImpedance) and its residual J a - aref at the solver's start.
+DEVICE void start_contact(World& w, int slot, const Touch& touch, Contact& contact) {
+  contact.weight = contact.normal = contact.first = contact.second = 0;
+  contact.d_normal = contact.d_first = contact.d_second = 0;
+  contact.dofs = 0;
+  if (!contact.exists) return;
+  const int c = contact.candidate;
+  const Vec n = touch.normal, r = touch.point, first = first_tangent(touch, c), second = cross(n, first);
+  contact.dofs = contact_dofs(c);
+  put_columns(w, slot, {n, first, second, cross(r, n), cross(r, first), cross(r, second)}, contact_damping(c), contact);
+  const real violation = touch.distance - contact_margin(c);
+  const real impedance = impedance_at(violation, contact_lowest(c), contact_highest(c), contact_inverse_width(c));
+  contact.weight = impedance * reciprocal(contact_regularisation(c) * (real(1) - impedance));
+  contact.normal += contact_stiffness(c) * impedance * violation;
+#if !OWN_SLOTS
+  w.moved[slot] = contact.dofs;
+#endif
+}
+
+// The same of a lane's joint, if it is beyond its range.
+DEVICE void start_limit(const World& w, int lane, Limit& limit) {
+  limit.weight = limit.residual = limit.sign = limit.change = 0;
+#if LIMITS > 0
+  if (lane >= LIMITS) return;
+  const int dof = limit_dof(lane);
+  const real q = w.qpos[dof - BASE_DOFS + BASE_QPOS], low = q - limit_low(lane), high = limit_high(lane) - q;
+  const real violation = (low < high ? low : high) - limit_margin(lane);
+  if (!(violation < 0)) return;
+  const real impedance = impedance_at(violation, limit_lowest(lane), limit_highest(lane), limit_inverse_width(lane));
+  limit.sign = low < high ? real(1) : real(-1);
+  limit.weight = impedance * reciprocal(limit_inverse_weight(lane) * (real(1) - impedance));
+  limit.residual = limit.sign * (w.acceleration[dof] + limit_damping(lane) * w.velocity[dof]) +
+                   limit_stiffness(lane) * impedance * violation;
+#endif
+}
+
+// Finds contacts and limits at the solver's start. Returns the slots in use.
+DEVICE unsigned find_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limit>& limits, bool& lost) {
+  PerLane<Touch> touch;
+  PerLane<bool> exists;
+  const int found = collect_contacts(w, contacts, touch);
+  lost = lost || found > SLOTS;
+  EACH_LANE {
+    exists[ME] = contacts[ME].exists;
+    start_contact(w, lane, touch[ME], contacts[ME]);
+    start_limit(w, lane, limits[ME]);
+  }
+  const unsigned existing = ballot(exists);
+#if !OWN_SLOTS
+  if (existing) {
+    ROLLED for (int dof = 0; dof < NV; ++dof) {
+      PerLane<bool> moved;
+      EACH_LANE moved[ME] = contacts[ME].dofs >> dof & 1u;
+      const unsigned slots = ballot(moved);
+      EACH_LANE if (lane == dof) w.touching[dof] = slots;
+    }
+  }
+#endif
+  return existing;
+}

@@ -1,0 +1,58 @@
+"""The step for GPUs, compiled for a CPU: the same source with loops for lanes, in float32 or float64."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import pathlib
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import envs.physics.fused
+from envs.physics.fused import threads
+from envs.physics.fused.model import Tables
+
+COMPILER = next((path for name in ("g++", "c++", "clang++") if (path := shutil.which(name))), None)
+compiled = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
+
+_SOURCE = pathlib.Path(__file__).with_suffix(".cpp")
+_FOLDER = pathlib.Path(str(envs.physics.fused.__file__)).parent
+
+Rows = dict[str, np.ndarray]
+
+
+def runner(tables: Tables, dtype: type[np.floating]) -> Callable[..., Rows]:
+    """A function of qpos [n, nq], qvel, warm start [n, nv] and ctrl [n, nu]: rows of new ones, overflow and readouts.
+
+    With `whole=False` it evaluates qacc of the states instead of a control step; the row is `warmstart`.
+    """
+    library = _built(threads.source(tables), np.dtype(dtype).name)
+
+    def run(*arrays: np.ndarray, whole: bool = True) -> Rows:
+        given = [np.ascontiguousarray(x, dtype) for x in arrays]
+        sizes = {"qpos": tables.nq, "qvel": tables.nv, "warmstart": tables.nv, "overflow": 1, "read": tables.width}
+        out = {name: np.zeros((len(given[0]), size), dtype) for name, size in sizes.items()}
+        addresses = [x.ctypes.data_as(ctypes.c_void_p) for x in (*given, *out.values())]
+        library.run(len(given[0]), int(whole), *addresses, tables.width)
+        return out
+
+    return run
+
+
+@functools.cache
+def _built(source: str, dtype: str) -> ctypes.CDLL:
+    folder = pathlib.Path(tempfile.mkdtemp(prefix="threads_on_cpu_"))
+    model, library = folder / "tables.h", folder / f"{hashlib.sha256(source.encode()).hexdigest()[:12]}.so"
+    model.write_text(source)
+    real = {"float32": "float", "float64": "double"}[dtype]
+    flags = ["-O1", "-std=c++17", "-shared", "-fPIC", f"-DREAL={real}", f'-DMODEL="{model}"', f"-I{_FOLDER}"]
+    subprocess.run([str(COMPILER), *flags, "-o", str(library), str(_SOURCE)], check=True)
+    loaded = ctypes.CDLL(str(library))
+    shutil.rmtree(folder)
+    return loaded
