@@ -5,7 +5,7 @@
 // Segments are parallel where the square of the sine between them is below this, and centres are one below TINY (mjMINVAL).
 // MuJoCo 3.17 has 1e-8 and 1e-15; rounding in float makes as much of what is zero in double.
 constexpr Real PARALLEL = SINGLE ? Real(1e-6) : Real(1e-8);
-constexpr Real TINY = SINGLE ? Real(1e-7) : Real(1e-15);
+constexpr Real TINY = SINGLE ? Real(2e-6) : Real(1e-15);
 
 // Impedance at a distance beyond the margin: a power of 2 with its midpoint at a half (engine_core_constraint.c,
 // getimpedance).
