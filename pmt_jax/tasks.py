@@ -160,7 +160,7 @@ def advice(env: Env) -> str | None:
 
 def compiler() -> str:
     """What compiles the engine `fused` here; needs one."""
-    return importlib.import_module(f"{_envs().__name__}.physics.fused.cpu").describe()
+    return importlib.import_module(f"{_envs().__name__}.physics.fused_engine").compiler()
 
 
 def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:

@@ -285,7 +285,7 @@ def test_broken_states_stay_broken_and_touch_no_other():
 @pytest.mark.skipif(jax.device_count() < 2, reason="one GPU")
 def test_devices_share_a_batch():
     made_of, states = robot("corridor")
-    step, mesh = gpu.make_step(made_of), jax.make_mesh((2,), ("env",))
+    step, mesh = gpu.make_step(made_of), jax.make_mesh((2,), ("env",), (jax.sharding.AxisType.Auto,))
     parts = jax.sharding.PartitionSpec("env")
     shared = jax.jit(jax.shard_map(step, mesh=mesh, in_specs=parts, out_specs=parts, check_vma=False))
     assert same(jax.jit(step)(*states), shared(*states))

@@ -33,6 +33,8 @@ TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_see
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
+OLD |= {"lambda_rule": "integral", "cost_advantage": "std", "fear_history": "rollout"}  # these are no settings any more
+OLD |= {"regret_mask": "top", "regret_target": "mode"}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"

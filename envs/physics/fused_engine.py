@@ -72,3 +72,8 @@ class FusedEngine:
             for (name, reading), part in zip(readings.items(), parts, strict=False)
         }
         return PhysicsState(qpos, qvel, warmstart), out | {"overflow": overflow[:, 0]}
+
+
+def compiler() -> str:
+    """What compiles the step for this process's devices."""
+    return cpu.describe() if jax.default_backend() == "cpu" else "compiled by NVRTC"

@@ -329,7 +329,10 @@ HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
 
 def _validate(config: Config) -> None:
     for field in dataclasses.fields(config):
-        bound, value = field.metadata["bound"], getattr(config, field.name)
+        bound, value, kind = field.metadata["bound"], getattr(config, field.name), FIELDS[field.name]
+        if typing.get_origin(kind) is Literal and value not in typing.get_args(kind):
+            choices = " | ".join(typing.get_args(kind))
+            raise UsageError(f"{field.name} = {value!r} does not fit: expected {choices}")
         if bound and not bound.holds(value):
             shown = list(value) if isinstance(value, tuple) else value
             raise UsageError(f"{field.name} must {bound.words}, not {shown}")

@@ -17,7 +17,7 @@ import os
 import pathlib
 import tomllib
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -167,12 +167,14 @@ class Saved(NamedTuple):
 
     Attributes:
       step: environment steps of each seed; packed: {path: array}, see `pack`.
+      row: what is known of a row that had not ended: arrays [seeds, ...] by their names.
       provenance: what it belongs to; None if it does not say so.
       damaged: the steps of newer ones that are not whole.
     """
 
     step: int
     packed: dict[str, np.ndarray]
+    row: dict[str, np.ndarray]
     provenance: Provenance | None
     damaged: list[int]
 
@@ -187,6 +189,7 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
     Raises:
       UsageError: there is none, or it is of another step than its name says.
     """
+    check_name(folder)
     damaged, place, steps = [], folder / "checkpoints", checkpoint_steps(folder)
     for step in steps:
         try:
@@ -201,7 +204,8 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
             warn(said)
             damaged.append(step)
             continue
-        return Saved(step, packed, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
+        row = {path[len(_ROW) + 2 : -2]: packed.pop(path) for path in list(packed) if path.startswith(_ROW)}
+        return Saved(step, packed, row, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
     if steps:
         raise UsageError(f"no checkpoint in {place} can be read; restore one from a backup or train anew")
     raise UsageError(f"there is no finished checkpoint in {place}; train the run first")
@@ -238,11 +242,6 @@ def check_name(folder: pathlib.Path) -> None:
             f"the path {folder} is not UTF-8, which checkpoints need; rename the folder, or set PYTHONUTF8=1 if the "
             "locale has another encoding"
         ) from None
-
-
-def open_row(packed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a checkpoint knows of a row that had not ended when it was saved: arrays [seeds, ...] by their names."""
-    return {path[len(_ROW) + 2 : -2]: x for path, x in packed.items() if path.startswith(_ROW)}
 
 
 class Checkpoints:

@@ -8,7 +8,6 @@ claimed: a folder that was deleted, renamed or replaced has no such file, or ano
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import pathlib
@@ -100,6 +99,8 @@ def _release(folder: pathlib.Path) -> None:
 
 def _open(folder: pathlib.Path, path: pathlib.Path) -> tuple[int, bool]:
     """The descriptor of the claim file `path`, and whether it is locked; UsageError if another process has the lock."""
+    import fcntl  # not on every system, and only training needs it
+
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:

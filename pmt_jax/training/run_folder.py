@@ -71,6 +71,7 @@ class RunFolder:
         self._setup, self._say, self._rescue = setup, say, rescue
         self._provenance = self._run = Provenance.of(setup)
         self._changes: list[Row] = []
+        self._is_edited = False
         self._loggers: list[Logger] = []
         self._claim, self._open = contextlib.ExitStack(), contextlib.ExitStack()
 
@@ -133,6 +134,7 @@ class RunFolder:
             self._run = Provenance(config, saved.provenance.trials)
         changed = self._run.differences(self._provenance)
         refused = {name: x for name, x in changed.items() if name in IDENTITY or not change}
+        self._is_edited = bool(edited)
         if edited and not changed:
             self._say(
                 f"{file} was edited since the checkpoint; the run continues with the settings it had:{listed(edited)}"
@@ -231,6 +233,7 @@ class RunFolder:
         rows = _keep_rows_until(self.path, step, self._say)
         if not ended:
             self._record_changes(step, old)
+        if not ended or self._is_edited:  # a run that has ended gets back what it was trained with
             write_settings(self.path, self._setup)
         if missing := missing_rows(self._setup.config, self._changes, rows, step):
             self._say(f"{self.path / 'metrics.jsonl'} lacks {missing}; tables are made of the others")

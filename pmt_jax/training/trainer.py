@@ -29,7 +29,7 @@ from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
 from . import chunks, claims, failures, health, jobs, processes
-from .checkpoint import open_row, unpack
+from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
@@ -221,7 +221,7 @@ class Trainer:
         """Continues from the newest checkpoint, if there is one."""
         tree, row = {"last": self.state, "best": self.best}, {}
         if saved := self.folder.saved:
-            self.step, tree, row = saved.step, unpack(saved.packed, tree), open_row(saved.packed)
+            self.step, tree, row = saved.step, unpack(saved.packed, tree), dict(saved.row)
         rows = self.folder.resume(self.step, ended=self.step >= self.total)
         self.say(f"resuming after {self.step:,} steps")
         seconds = row.pop("seconds", np.array([rows[-1]["seconds"] if rows else 0.0]))

@@ -98,7 +98,7 @@ train lane --cost-estimate critic --gamma 1 | set gamma below 1 or take another 
 train lane --method macpo --limit-lr 3 | limit_lr must lie in [0, 1], not 3.0
 train lane --method macpo --kl-limit inf | kl_limit must be a number above 0, not inf
 train lane --lambda-unit relative --lambda-init 0 | with lambda_unit = relative a multiplier of 0 never moves
-train lane --physics= | physics = '' does not fit: expected auto | mjx
+train lane --physics= | physics = '' does not fit: expected auto | fused | mjx
 train lane --env num_agents | env = ['num_agents'] does not fit: expected name=value
 train ant_2x4 --env physics=warp | 'physics' is no option of a task; set physics = ... (--physics)
 train lane --env name=3 | 'name' is no option of a task; name the task itself

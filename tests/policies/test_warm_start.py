@@ -53,7 +53,7 @@ def test_networks_and_moments_are_the_other_runs_and_all_else_is_new(whole: path
         chex.assert_trees_all_equal(now.opt_state, before.opt_state)
     chex.assert_trees_all_equal(state.critic.returns, jax.tree.map(lambda x: x[turn], other.critic.returns))
     chex.assert_trees_all_equal(state.state_moments, jax.tree.map(lambda x: x[turn], other.state_moments))
-    for name in ("multiplier", "episode_cost", "rollout", "key", "update"):
+    for name in ("constraint", "rollout", "key", "update"):
         chex.assert_trees_all_equal(getattr(state, name), getattr(fresh, name))
 
 

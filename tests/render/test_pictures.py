@@ -279,6 +279,7 @@ def test_limits_of_several_costs_are_no_metric_of_a_report(monkeypatch: pytest.M
         "cost_limit/1": 2.0,
         "episode_reward": (1.0, 0.5),
         "info/speed": (2.0, 0.1),
+        "faults": "",
     }
     monkeypatch.setattr(report.evaluate, "evaluate_run", lambda *_: [result])
     text = "".join(report._evaluation(pathlib.Path("x"), 2))

@@ -21,7 +21,7 @@ from pmt_jax.policies import publish
 from pmt_jax.policies.load import trusting
 from pmt_jax.render import episode
 from pmt_jax.training import run_folder
-from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.checkpoint import Checkpoints, Provenance
 from runs import rows
 
 TASK = """
@@ -170,7 +170,7 @@ def test_the_policy_that_is_published_keeps_every_agent_within(file: pathlib.Pat
     run_folder.write_settings(out, setup)
     known = dataclasses.replace(run_folder.initial_best(state), state=pushing(0.0, 0.0))
     checkpoints = Checkpoints(out)
-    checkpoints.save(100, {"last": pushing(1.0, 0.0), "best": known})
+    checkpoints.save(100, {"last": pushing(1.0, 0.0), "best": known}, Provenance(setup.config))
     checkpoints.close()
     _, which, found, _ = publish.choose(out, 2)
     assert which == "best" and found["episode_cost_worst"][0] == 0

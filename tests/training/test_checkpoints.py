@@ -259,13 +259,13 @@ def test_rows_are_expected_where_changes_put_them():
         {"step": 600, "changed": {"log_interval": "2 -> 1", "clip": "0.2 -> 0.1"}},
         {"step": 800, "changed": {"log_interval": "1 -> 5"}},
     ]
-    steps = [200, 400, 600, 700, 800, 1300, 1800]
+    steps = [200, 400, 600, 700, 800, 1000, 1500, 2000]
     assert list(row_steps(config, changes, 2000)) == steps and list(row_steps(config, changes, 650)) == [200, 400, 600]
     found = [{"seed": seed, "step": step} for seed in (0, 1) for step in steps]
-    assert missing_rows(config, changes, found, 1800) is None
-    assert missing_rows(config, changes, found[:-1], 1800) == "1 of 14 rows up to step 1,800: 1 of seed 1 (step 1,800)"
-    foreign = missing_rows(config, changes, [row | {"seed": 7} for row in found[:7]], 1800)
-    assert foreign and "7 of seed 0" in foreign and "of other seeds: 7" in foreign
+    assert missing_rows(config, changes, found, 2000) is None
+    assert missing_rows(config, changes, found[:-1], 2000) == "1 of 16 rows up to step 2,000: 1 of seed 1 (step 2,000)"
+    foreign = missing_rows(config, changes, [row | {"seed": 7} for row in found[:8]], 2000)
+    assert foreign and "8 of seed 0" in foreign and "of other seeds: 7" in foreign
 
 
 @pytest.mark.parametrize("line", ['{"step": 3}', '{"step": "3", "changed": {}}', '{"step": 3, "changed": {"clip": 1}}'])

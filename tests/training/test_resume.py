@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pathlib
 import re
 import shlex
@@ -90,7 +91,14 @@ def test_a_full_disk_stops_the_run_and_nothing_saved_is_lost(whole: pathlib.Path
 
 
 def test_rows_that_cannot_be_written_stop_the_run(tmp_path: pathlib.Path, cli, monkeypatch):
-    monkeypatch.setattr(loggers.Jsonl, "__init__", lambda self, path: setattr(self, "_file", open("/dev/full", "w")))
+    begin = loggers.Jsonl.__init__
+
+    def full(self: loggers.Jsonl, path: pathlib.Path) -> None:
+        begin(self, path)
+        os.dup2(os.open("/dev/full", os.O_WRONLY), self._file.fileno())
+
+    monkeypatch.setattr(loggers.Jsonl, "__init__", full)
+    monkeypatch.setattr(loggers.Jsonl, "is_there", True)
     out = tmp_path / "run"
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
     assert code == 1 and not err and f"stopped: cannot write into {out}: No space left on device" in text
