@@ -115,7 +115,7 @@ def excess(cost: Any, limit: Any, xp: Any = np) -> Any:
 
 
 def columns(name: str, x: Any, shared: bool) -> dict[str, Any]:
-    """What stands beside a column `name` that is one number for x [..., N, K]: the parts of x, by their names.
+    """The columns for the parts of x [..., N, K], for which a column `name` has one number.
 
     `NAME/k` is the mean over agents, of each of several costs. `NAME/agent_i`, of several costs `NAME/agent_i/cost_k`,
     is of one agent, where agents do not share their costs.

@@ -185,7 +185,7 @@ def changes(old: Mapping[str, Any], new: Mapping[str, Any], run: object) -> list
     """What of `record` differs from what a run has recorded, as `name old -> new`; of older runs nothing is known.
 
     Raises:
-      UsageError: the run would go on with other random numbers.
+      UsageError: the run would continue with other random numbers.
     """
     found = []
     for part in ("jax_settings", "variables"):

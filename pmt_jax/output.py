@@ -25,7 +25,7 @@ def say(line: str) -> None:
 
 
 def result(text: str) -> None:
-    """Prints what a command was asked for, lines without the last newline; drops it if nobody reads any more.
+    """Prints what a command was asked for, lines without the last newline; drops it if the reader has ended.
 
     Raises:
       UsageError: as `check_written`.
@@ -35,7 +35,7 @@ def result(text: str) -> None:
 
 
 def check_written() -> None:
-    """Whether all that this command has printed was written, or nobody reads it any more.
+    """Whether all that this command has printed was written, or its reader has ended.
 
     Raises:
       UsageError: it was not: a full disk, a quota.

@@ -1,7 +1,7 @@
 """Which Python files of tasks may be executed: those whose content this user has run himself, or said to trust.
 
-Whoever names a file on a command line wants it executed. A run folder, or a file of settings, may come from somebody
-else and name any file, so the files that it names are executed only if their digest is known. Digests are kept in
+Whoever names a file on a command line wants it executed. A run folder, or a file of settings, may come from another
+person and name any file, so the files that it names are executed only if their digest is known. Digests are kept in
 `pmt-jax/trusted` of the user's state folder (XDG_STATE_HOME), one a line with the file that it was of; a line that is
 deleted is no longer trusted.
 """
@@ -63,7 +63,7 @@ def check(task: str, named_by: str, run: pathlib.Path | None = None) -> None:
       run: the run folder.
 
     Raises:
-      UsageError: the file would be executed, and nobody has said that it may.
+      UsageError: the file would be executed, and is not trusted.
     """
     if not is_file(task):
         return

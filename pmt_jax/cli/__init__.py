@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _use_utf8() -> None:
     """Starts this process anew in Python's UTF-8 mode where the locale has another encoding (LC_ALL=C).
 
-    Checkpoints take file names in UTF-8 alone, and so are the texts that are read and written.
+    Checkpoints take file names in UTF-8 alone, and the program reads and writes texts in it.
     """
     if codecs.lookup(sys.getfilesystemencoding()).name == "utf-8" or "utf8" in sys._xoptions or not sys.executable:
         return

@@ -168,7 +168,7 @@ class Saved(NamedTuple):
     Attributes:
       step: environment steps of each seed; packed: {path: array}, see `pack`.
       row: what is known of a row that had not ended: arrays [seeds, ...] by their names.
-      provenance: what it belongs to; None if it does not say so.
+      provenance: what it belongs to; None if that is unknown.
       damaged: the steps of newer ones that are not whole.
     """
 

@@ -133,7 +133,7 @@ def _readings(t: Tables) -> Iterable[tuple[int, int]]:
 
 
 def _table(kind: str, name: str, rows: Iterable[Any]) -> str:
-    """An array of rows; of one row of zeros if there is none, as C++ knows no empty arrays."""
+    """An array of rows; of one row of zeros if there is none, as C++ has no empty arrays."""
     return f"constexpr {kind} {name}[] = {{{', '.join(map(_value, rows)) or '{}'}}};"
 
 

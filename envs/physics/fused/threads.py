@@ -1,7 +1,7 @@
 """The tables of a model as C++ for the schedule "one warp a world": threads.h and threads_*.h.
 
 The warp's lanes take the model's items (joints, bodies, dofs, entries of matrices, contacts), so what differs between
-items is looked up by lane, and what is the same for all becomes a constant. The order in which M's factor is worked out
+items is looked up by lane, and what is the same for all becomes a constant. The order in which M's factor is computed
 is decided here: the trunk (dofs 0 to T - 1, one path) by all lanes alike, the branches on it in rounds, each dof in the
 round after the last of those that hang on it.
 """
