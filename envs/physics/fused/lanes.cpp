@@ -128,7 +128,7 @@ bool failed(const XLA_FFI_Api* api, XLA_FFI_Error* error) {
 
 // XLA asks for the version of the interface when the function is registered.
 bool is_query(XLA_FFI_CallFrame* frame) {
-  for (XLA_FFI_Extension_Base* base = frame->extension_start; base; base = base->next) {
+  for (auto* base = frame->extension_start; base; base = base->next) {  // whose type has two names
     if (base->type != XLA_FFI_Extension_Metadata) continue;
     XLA_FFI_Metadata* metadata = ((XLA_FFI_Metadata_Extension*)base)->metadata;
     metadata->api_version.major_version = XLA_FFI_API_MAJOR;
