@@ -90,7 +90,7 @@ def compare(task: str, share_rows: bool = False, **sizes: object) -> dict:
 @pytest.mark.full
 def test_seeds_and_environments_split_change_nothing_but_rounding():
     """The corridor ant under the method with the most networks; the C engine steps each device's own environments."""
-    found = compare("ant_2x4", share_rows=True, method="mixed", seeds=2, num_envs=8)
+    found = compare("ant_2x4", share_rows=True, physics="mujoco", method="mixed", seeds=2, num_envs=8)
     assert found["leaves"] > 100 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
