@@ -98,13 +98,18 @@ def train(
         folder.claim(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
         _describe(setup, folder.path, say)
-        if cache:
-            use_cache()
-        with failures.named():
-            state, programs = (jobs.start if workers > 1 else compile_run)(setup, say)
+        state, programs = _compile(setup, cache, say)
         stack.callback(programs.close)
         trainer = Trainer(setup, programs, begin(state) if begin else state, folder, say)
         return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
+
+
+def _compile(setup: Setup, cache: bool, say: Say) -> tuple[LearnerState, Programs]:
+    """The first state and the run's programs, in this process or in its workers."""
+    if cache:
+        use_cache()
+    with failures.named():
+        return (jobs.start if setup.jobs > 1 else compile_run)(setup, say)
 
 
 def _make_setup(config: Config, trials: Trials | None, count: int | None, debug: bool) -> Setup:
