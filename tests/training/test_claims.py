@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pathlib
@@ -92,7 +93,7 @@ def test_where_files_cannot_be_locked_the_process_in_the_file_counts(tmp_path: p
     def cannot_lock(*_: object) -> None:
         raise OSError(38, "Function not implemented")
 
-    monkeypatch.setattr(claims.fcntl, "flock", cannot_lock)
+    monkeypatch.setattr(fcntl, "flock", cannot_lock)
     file = tmp_path / claims.NAME
     owner = {"pid": os.getppid(), "host": socket.gethostname(), "since": "2026-01-01 00:00:00"}
     file.write_text(json.dumps(owner))
