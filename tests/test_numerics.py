@@ -250,6 +250,7 @@ def test_a_run_of_an_earlier_version_continues(copy: pathlib.Path, cli):
     assert code == 0 and "changed since" not in text
 
 
+@pytest.mark.full
 def test_a_run_of_other_keys_is_evaluated_without_them(tmp_path: pathlib.Path, cli):
     out, kind = tmp_path / "run", "rbg"
     arguments = ("train", "lane", *TINY, "--hidden", 3, "--method", "mappo", "--no-cache", "--out", out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import pathlib
@@ -207,9 +208,14 @@ def as_larger(files: pathlib.Path) -> str:
     return markdown(head, body)
 
 
+@functools.cache  # each run is compared with each
+def _settings(config: str) -> dict[str, Any]:
+    return tomllib.loads(config)
+
+
 def _kind(run: Run) -> tuple[Any, ...]:
     """What runs of one sample have in common; settings that are newer than a run have what was done before."""
-    stored = tomllib.loads(run["config"])
+    stored = _settings(run["config"])
     every = {field.name: field.default for field in dataclasses.fields(Config)} | OLD | stored | stored.get("env", {})
     same = {name: repr(value) for name, value in every.items() if name not in OF_A_SAMPLE | {"env"}}
     return run["source"], max(run["steps"]), sorted(same.items())

@@ -23,6 +23,7 @@ def in_ascii(folder: pathlib.Path, *command: str | bytes) -> subprocess.Complete
     return subprocess.run([sys.executable, *command], env=environ, cwd=folder, capture_output=True, text=True)
 
 
+@pytest.mark.full
 def test_every_locale_is_taken_for_utf8(whole: pathlib.Path, tmp_path: pathlib.Path):
     """Checkpoints take no other names, and the page has letters that ASCII lacks."""
     shutil.copytree(whole, tmp_path / "r\u00fcn")

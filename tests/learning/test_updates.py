@@ -185,7 +185,9 @@ def test_what_counts_late_in_a_run_counts_after_its_start(start: int):
     assert held.critic_lr.tolist() == [setup.hyper.critic_lr] * 4
 
 
-@pytest.mark.parametrize("method", ["mappo", "mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "method", ["mappo_l", *(pytest.param(name, marks=pytest.mark.full) for name in ("mappo", "macpo"))]
+)
 def test_noise_halves_in_its_half_life_beside_what_is_learned(method: str):
     """One actor for all agents or one each, clipped epochs or a trust region: all else is learned bit for bit alike."""
     made = program(method)
@@ -296,6 +298,7 @@ def estimated(how: str, horizon: int, batch: Batch, previous: jax.Array) -> jax.
     return constraint.estimate_cost(how, horizon, batch, previous, jnp.zeros_like(batch.cost), 0.99)
 
 
+@pytest.mark.full
 def test_the_critics_estimate_is_the_rate_that_its_values_are_of():
     """A cost of 0.25 in every step has a discounted value of 0.25 / (1 - gamma)."""
     _, _, batch = acted()
@@ -373,7 +376,8 @@ def test_a_cost_that_is_its_limit_is_within_it(seen: float, limit: int):
     assert (beyond[:, 0] > 0).tolist() == [False, False, True]
 
 
-@pytest.mark.parametrize("estimate", ["rate", pytest.param("critic", marks=pytest.mark.full)])
+@pytest.mark.parametrize("estimate", ["rate", "critic"])
+@pytest.mark.full
 def test_the_cost_beyond_is_that_of_episodes_however_the_multiplier_estimates_it(estimate: str):
     """Batches of a fifth of an episode: nan where none ended."""
     config = load_config("lane", method="mappo", cost_estimate=estimate, **SMALL | {"rollout_length": 5})
@@ -405,6 +409,7 @@ def test_figures_of_episodes_count_finished_ones_only():
     np.testing.assert_array_equal(metrics["episode_length"][np.array([2, 4])], 25)
 
 
+@pytest.mark.full
 def test_spread_starts_end_as_many_episodes_in_every_rollout_and_count_whole_ones():
     """Ten environments and rollouts of 5 steps: an episode of 25 steps is five rollouts long."""
     small = {"method": "mappo", "epochs": 1, "minibatches": 1, "time_limit": "terminate"}

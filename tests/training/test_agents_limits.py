@@ -196,6 +196,7 @@ def test_episodes_of_an_evaluation_are_within_if_every_agent_and_cost_is(file: p
     assert found["episode_cost_worst"].mean() == pytest.approx(max(totals))
 
 
+@pytest.mark.full
 def test_a_task_that_only_says_that_its_agents_share_costs_is_refused_or_stops(file: pathlib.Path, cli, tmp_path):
     """At once where the first steps show it, else with the first row in which it is so."""
     early = file.with_name("early.py")

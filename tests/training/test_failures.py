@@ -34,6 +34,7 @@ class Sensor(Lane):
 """
 
 
+@pytest.mark.full
 def test_a_host_callback_that_raises_costs_one_chunk(tmp_path: pathlib.Path, cli, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sensor.py").write_text(CALLBACK)

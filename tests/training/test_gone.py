@@ -162,6 +162,7 @@ def test_a_claim_ends_without_touching_the_folder_that_took_its_place(what: Call
     assert content(tmp_path) == before and not claims.is_held(out)
 
 
+@pytest.mark.full
 def test_a_program_of_a_sweep_is_saved_beside_the_sweep_and_goes_on_there(tmp_path: pathlib.Path, cli, happens):
     words = ("sweep", "lane", *ARGUMENTS[1:11], "--method", "mappo_l", "--steps", 600, "--no-cache")
     words = (*words, "--set", "clip=0.1,0.2", "--seeds", 2)
@@ -183,6 +184,7 @@ def test_a_program_of_a_sweep_is_saved_beside_the_sweep_and_goes_on_there(tmp_pa
         assert_same_run(tmp_path / "sweep-rescued" / name, other / name)
 
 
+@pytest.mark.full
 def test_what_follows_in_a_sweep_that_is_gone_is_not_trained(tmp_path: pathlib.Path, cli, monkeypatch):
     from pmt_jax.studies import sweep
 

@@ -104,6 +104,7 @@ def test_rows_that_cannot_be_written_stop_the_run(tmp_path: pathlib.Path, cli, m
     assert code == 1 and not err and f"stopped: cannot write into {out}: No space left on device" in text
 
 
+@pytest.mark.full
 def test_a_run_of_more_steps_than_fit_into_int32_is_resumed(copy: pathlib.Path, cli):
     step, updates = 3_000_000_000, 30_000_000
     setup, _, saved = run_folder.load_saved(copy)

@@ -357,6 +357,7 @@ def test_baselines_order_as_they_should() -> None:
     np.testing.assert_allclose(rate["zero"], 1 - found["zero"]["violation_rate"], atol=1e-6)
 
 
+@pytest.mark.full
 def test_the_example_of_a_whole_grid_changes_what_agents_see_and_nothing_else():
     regions, whole = envs.make("voltage_141"), envs.make(f"{ROOT / 'docs/examples/whole_grid.py'}:make")
     buses = regions.scenario.network.n_bus - 1  # without the slack
