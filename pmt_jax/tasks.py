@@ -14,7 +14,7 @@ from .errors import UsageError
 if TYPE_CHECKING:
     from envs.base import Env, EnvSpec, Policy, State, declarations, shares_cost
     from envs.columns import Column
-    from envs.vector import Outcome, VectorEnv, VectorState, felt_cost
+    from envs.vector import Outcome, VectorEnv, VectorState, observed_cost
 
 __all__ = [
     "Env",
@@ -35,7 +35,7 @@ __all__ = [
     "engines",
     "explain_options",
     "installed_version",
-    "felt_cost",
+    "observed_cost",
     "is_file",
     "kernels",
     "make",
@@ -59,7 +59,7 @@ def _envs() -> types.ModuleType:
 
 _CONTRACT = {"Env": "base", "EnvSpec": "base", "State": "base", "declarations": "base"}
 _CONTRACT |= {"shares_cost": "base"}
-_CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
+_CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "observed_cost": "vector"}
 
 
 def __getattr__(name: str) -> Any:

@@ -71,8 +71,8 @@ def test_episodes_of_training_are_within_if_every_agent_and_cost_is(data: st.Dat
     )
     batch.done = batch.finished
     limit = jnp.asarray(limits.each, jnp.float32) if len(limits.each) > 1 else jnp.float32(limits.total)
-    hyper: Any = types.SimpleNamespace(cost_limit=limit, cost_seen=1.0, cost_false=0.0)
-    kept = rollout.limits_kept(batch, hyper, 25)
+    hyper: Any = types.SimpleNamespace(cost_limit=limit, cost_seen=1.0)
+    kept = rollout.limit_metrics(batch, hyper)
     each = [beyond(one, limits) for one in cost[finished]]
     within = [all(x == 0 for agent in one for x in agent) for one in each]
     furthest = [sum(max(agent[k] for agent in one) for k in range(len(limits.each))) for one in each]

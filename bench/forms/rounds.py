@@ -219,7 +219,7 @@ def as_lag_in_time(file: pathlib.Path) -> str:
     updates = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24)  # one point of the curves each
     body = []
     for run in cells:
-        for name, what in (("on_costly", "a step felt as costly"), ("on_safe", "others")):
+        for name, what in (("on_costly", "a step observed as costly"), ("on_safe", "others")):
             found = run["diagnostics"][f"fear/{name}"]
             body.append([label(run, cells), what, *(f"{found[update - 1]:.2f}" for update in updates)])
     return markdown(["method", "mean fear of", *(f"update {update}" for update in updates)], body)
@@ -263,13 +263,13 @@ def as_prior(file: pathlib.Path) -> str:
 
 
 def as_prior_in_time(file: pathlib.Path) -> str:
-    """Question d: fear of the steps that are felt as costly, and true cost, in each tenth of the run; seeds' means."""
+    """Question d: fear of the steps observed as costly, and true cost, in each tenth of the run; seeds' means."""
     body = []
     for run in _prior_last(file):
         fear = run["diagnostics"]["fear/on_costly"]
         cost = 1000 * np.nanmean(np.array(run["true_step_cost"], float), axis=0)
         name = label(run, _prior_last(file))
-        body.append([name, "fear of a step felt as costly", *(f"{x:.2f}" for x in fear)])
+        body.append([name, "fear of a step observed as costly", *(f"{x:.2f}" for x in fear)])
         body.append([name, "true cost per 1,000 steps", *(f"{x:.0f}" for x in cost)])
     return markdown(["method", "mean", *(f"to {x / 1e6:.1f} M" for x in run["steps"])], body)
 
@@ -364,7 +364,7 @@ def _second(file: pathlib.Path) -> list[runs.Run]:
 
 
 def _cell(found: Sequence[runs.Run], task: str, seen: float, **wanted: Any) -> runs.Run:
-    """The first run of the task, of this share of felt costs, with these settings."""
+    """The first run of the task, of this share of observed costs, with these settings."""
     wanted |= {"cost_seen": seen}
     return next(run for run in found if run["task"] == task and settings(run).items() >= wanted.items())
 

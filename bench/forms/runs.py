@@ -34,12 +34,12 @@ DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 OLD |= {"lambda_rule": "integral", "cost_advantage": "std", "fear_history": "rollout"}  # these are no settings any more
-OLD |= {"regret_mask": "top", "regret_target": "mode"}
+OLD |= {"regret_mask": "top", "regret_target": "mode", "cost_false": 0.0}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
-TRUE = "true cost"  # also of steps that the team did not notice
+TRUE = "true cost"  # also of steps that the learner did not observe
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 

@@ -1,4 +1,4 @@
-"""The tables of docs/results/study.md: stored runs of seldom felt costs, read as the preregistration says.
+"""The tables of docs/results/study.md: stored runs of seldom observed costs, read as the preregistration says.
 
 Those of the later rounds are in rounds.py.
 """
@@ -292,8 +292,8 @@ def as_weights(file: pathlib.Path) -> str:
 def as_why(file: pathlib.Path) -> str:
     """What the policy learned from: how well the cost critic explains its targets, how fear tells danger from safety.
 
-    Means over seeds and over the chunks of the first and of the second half of training. Targets are felt costs, with
-    F4SG and Mixed fear.
+    Means over seeds and over the chunks of the first and of the second half of training. Targets are observed
+    costs, with F4SG and Mixed fear.
     """
     body = []
     every = sorted(runs.load(file), key=lambda run: (-share(run), list(NAMES).index(run["method"])))
@@ -310,12 +310,12 @@ def as_why(file: pathlib.Path) -> str:
         )
         body.append([*line, *shown])
     head = ["p", "method", "explained variance of the cost critic, first half", "second half"]
-    head += ["fear of a step that is felt as costly", "of others", "ratio", "calibration error (ECE)"]
+    head += ["fear of a step that is observed as costly", "of others", "ratio", "calibration error (ECE)"]
     return markdown(head, body)
 
 
 def as_noise(file: pathlib.Path) -> str:
-    """Noise of the cost advantage with the critic's values set aside: of felt costs and of fear, a row for each p.
+    """Noise of the cost advantage with the critic's values set aside: of observed costs and of fear, a row for each p.
 
     Means and standard deviations over seeds; docs/figures/noise.py defines the measures.
     """
@@ -327,8 +327,8 @@ def as_noise(file: pathlib.Path) -> str:
 
     columns = [(measure, signal) for measure in ("noise_share", "correlation") for signal in ("cost", "fear")]
     shares = dict.fromkeys(row["p"] for row in rows)
-    head = ["p", "noise share, felt cost", "noise share, fear"]
-    head += ["correlation with the advantage of the true cost, felt cost", "the same, fear"]
+    head = ["p", "noise share, observed cost", "noise share, fear"]
+    head += ["correlation with the advantage of the true cost, observed cost", "the same, fear"]
     return markdown(head, [[f"{p:g}", *(cell(p, *column) for column in columns)] for p in shares])
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from ..limits import columns
 from .rollout import finished_mean
 from .schedules import Schedule
-from .setup import Setup, held_limit
+from .setup import Setup, limit_less_margin
 from .types import Batch, Constraint, Hyper, Metrics, PolicyRows
 
 LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
@@ -34,7 +34,7 @@ def init(setup: Setup, hyper: Hyper) -> Constraint:
 
 def target(hyper: Hyper) -> jax.Array:
     """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
-    return held_limit(hyper, hyper.cost_margin)
+    return limit_less_margin(hyper, hyper.cost_margin)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -91,7 +91,7 @@ def excess_in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.
     if setup.config.lambda_unit == "step":
         return excess
     # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
-    limit = target(hyper) if setup.config.lambda_unit == "relative" else held_limit(hyper, 0.0)
+    limit = target(hyper) if setup.config.lambda_unit == "relative" else limit_less_margin(hyper, 0.0)
     return relative_excess(excess, limit, setup.vector.horizon)
 
 

@@ -159,7 +159,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch, setup.shares_cost),
-        **rollout.limits_kept(batch, hyper, horizon),
+        **rollout.limit_metrics(batch, hyper),
         **constraint.metrics(setup, held, price(held.multiplier), excess),
         **_named("critic", critic_metrics),
         **_named("cost_critic", cost_critic_metrics),
@@ -180,8 +180,8 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
         partial(setup.scale, state.state_moments),
     )
 
-    def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
-        return tasks.felt_cost(cost, jax.random.fold_in(tagged[Tag.FELT], t), hyper.cost_seen, hyper.cost_false)
+    def observe(cost: jax.Array, t: jax.Array) -> jax.Array:
+        return tasks.observed_cost(cost, jax.random.fold_in(tagged[Tag.OBSERVED_COST], t), hyper.cost_seen)
 
     after, batch, (obs, global_state) = rollout.collect(
         watched(setup, state.update),
@@ -190,7 +190,7 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
         normalisers,
         tagged[Tag.ACTION],
         setup.config.rollout_length,
-        feel,
+        observe,
     )
     moments = (
         running_moments.accumulate(state.obs_moments, obs),

@@ -63,7 +63,7 @@ def appraise_regret(
 
 
 def regret(logits: jax.Array, cost: jax.Array) -> jax.Array:
-    """Regret per action entry, felt only where the step was costly: sigmoid(l) 1[C > 0] (Eq. 13).
+    """Regret per action entry, where the step was costly: sigmoid(l) 1[C > 0] (Eq. 13).
 
     Args:
       logits: [..., A]; cost: [..., K] in [0, 1]; with several costs any of them will do.

@@ -52,7 +52,7 @@ class Setup:
     @property
     def limits(self) -> Limits:
         """What the learner holds the costs of every agent to, as it observes them."""
-        return Limits.of_run(self.config, self.vector.spec, self.vector.horizon)
+        return Limits.of_run(self.config, self.vector.spec)
 
     @property
     def limits_of_seeds(self) -> list[Limits]:
@@ -95,7 +95,7 @@ class Setup:
         return self.trials.hyper, keys(self.trials.seed), (0 if jnp.ndim(self.trials.hyper.clip) else None, 0)
 
 
-def held_limit(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
+def limit_less_margin(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
     """The limits [] or [K] of an episode's costs less a margin, a share of them; traced."""
     return jnp.asarray(hyper.cost_limit) * (1 - margin)
 

@@ -33,7 +33,7 @@ class Tag(enum.IntEnum):
     COST_CRITIC = 6
     FEAR = 7
     REGRET = 8
-    FELT = 9
+    OBSERVED_COST = 9
 
 
 @pytree
@@ -75,7 +75,7 @@ class Batch:
       obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
         under the policy that acted; std: [T, B, N, A] likewise.
       state, next_state: [T, B, S]; the next state is the one before any reset.
-      reward: [T, B]; cost: [T, B, N, K] as felt (see `envs.vector.felt_cost`); true_cost: the same as it was.
+      reward: [T, B]; cost: [T, B, N, K] as observed (see `envs.vector.observed_cost`); true_cost: the same as it was.
       terminated, truncated: [T, B] bool, never both.
       info: {name: [T, B]}.
       non_finite: [T, B] bool, quarantined steps; cost_out_of_range: [T, B] bool, steps with a cost outside [0, 1].

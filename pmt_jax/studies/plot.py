@@ -122,14 +122,14 @@ def caption(shown: Sequence[Group]) -> str:
 
 
 def panels(shown: Sequence[Group], wanted: dict[str, str]) -> list[str]:
-    """The metrics among `wanted` that any run has; true costs only if a run did not feel all of them."""
+    """The metrics among `wanted` that any run has; true costs only if a run did not observe all of them."""
 
     def known(name: str) -> bool:
         return any(np.isfinite(run.metrics.get(name, np.nan)).any() for group in shown for run in group.runs)
 
     runs = [run for group in shown for run in group.runs]
-    felt = all(same(run.metrics.get("true_violation_rate"), run.metrics.get("violation_rate")) for run in runs)
-    return [name for name in wanted if known(name) and not (felt and name.startswith("true_"))]
+    observed = all(same(run.metrics.get("true_violation_rate"), run.metrics.get("violation_rate")) for run in runs)
+    return [name for name in wanted if known(name) and not (observed and name.startswith("true_"))]
 
 
 def titles(shown: Sequence[Group]) -> dict[str, str]:

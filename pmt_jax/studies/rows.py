@@ -49,7 +49,7 @@ COLUMNS = (
     Column("cost", "episode_cost", 0, note="cost: undiscounted, of one agent (mean over agents), per episode"),
     Column("worst agent", f"episode_cost{WORST}", 0, note="worst agent: cost of the agent whose is highest"),
     Column("violation rate", "violation_rate", 0, 1, "violation rate: share of steps with a cost for some agent"),
-    Column("true cost", "true_episode_cost", 0, note="true: with the costs that the team did not feel"),
+    Column("true cost", "true_episode_cost", 0, note="true: with the costs that the learner did not observe"),
     Column("true worst agent", f"true_episode_cost{WORST}", 0),
     Column("true violation rate", "true_violation_rate", 0, 1),
     Column("true step cost", "true_step_cost", 0),
@@ -179,19 +179,19 @@ def _row(group: Group) -> Row:
 
 
 def shown(rows: Sequence[Row]) -> list[Column]:
-    """The columns that any row has, in order; true costs only if a run did not feel all of them."""
+    """The columns that any row has, in order; true costs only if a run did not observe all of them."""
     every = columns(row.task for row in rows)
     present = [column for column in every if any(column.name in row.scores for row in rows)]
-    felt = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)
-    return [column for column in present if not (felt and column.name.startswith("true "))]
+    observed = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)
+    return [column for column in present if not (observed and column.name.startswith("true "))]
 
 
-def same(true: np.ndarray | None, felt: np.ndarray | None) -> bool:
-    """Whether true costs are the felt ones, as far as both are known."""
-    return true is None or felt is None or np.array_equal(true, felt, equal_nan=True)
+def same(true: np.ndarray | None, observed: np.ndarray | None) -> bool:
+    """Whether true costs are the observed ones, as far as both are known."""
+    return true is None or observed is None or np.array_equal(true, observed, equal_nan=True)
 
 
 def compared(rows: Sequence[Row]) -> tuple[str, str]:
-    """The columns that rows are compared by: reward, and the cost as it was, felt or not, of the worst agent."""
+    """The columns that rows are compared by: reward, and the cost as it was, observed or not, of the worst agent."""
     names = [column.name for column in shown(rows)]
     return "reward", next(x for x in ("true worst agent", "true cost", "worst agent", "cost") if x in (*names, "cost"))

@@ -103,24 +103,21 @@ class RunLog:
     def excess(self) -> np.ndarray:
         """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest.
 
-        If not all of one cost is felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones
-        are felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
+        If not all of one cost is observed (`cost_seen`), it is the true cost beyond the limit on true costs.
         """
         seen = self.settings.get("cost_seen", 1.0)
-        true = seen < 1 and len(self.limits.each) == 1 and self.true_limits is not None
+        true = seen < 1 and len(self.limits.each) == 1
         if true and "true_episode_cost" in self.metrics:
             return self.limits.true(seen).excess(self._costs("true_episode_cost"))
         return self.limits.excess(self._costs("episode_cost"))
 
     @property
-    def true_limits(self) -> Limits | None:
-        """The limits on true costs, of which the team feels a share; None if it feels false ones, too."""
-        if self.settings.get("cost_false", 0.0):
-            return None  # they depend on the time limit, which a run folder does not say
+    def true_limits(self) -> Limits:
+        """The limits on true costs, of which the learner observes a share."""
         return self.limits.true(self.settings.get("cost_seen", 1.0))
 
-    def limits_on(self, metric: str) -> Limits | None:
-        """The limits on a metric of costs; None if they are unknown."""
+    def limits_on(self, metric: str) -> Limits:
+        """The limits on a metric of costs."""
         return self.true_limits if metric.startswith("true_") else self.limits
 
     def _costs(self, name: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from bench.forms.study import measures, welch
 def stored(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
     """A run of three seeds and ten points whose true episode cost is constant."""
     points, seeds = 10, len(true_cost)
-    config = {"cost_seen": seen, "cost_false": 0.0, "lambda_init": 2.0, "method": method} | settings
+    config = {"cost_seen": seen, "lambda_init": 2.0, "method": method} | settings
     curve = {name: [[1.0] * points] * seeds for name in ("episode_reward", "episode_cost", "violation_rate", "lambda")}
     return {
         "steps": list(range(10, 110, 10)),

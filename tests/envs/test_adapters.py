@@ -80,7 +80,7 @@ def test_pettingzoo_passes_its_own_test():
     parallel_api_test(adapters.to_pettingzoo(envs.make("noisy")), num_cycles=60)
 
 
-def test_pettingzoo_agents_have_the_actions_they_have_and_feel_their_costs():
+def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
     pytest.importorskip("pettingzoo")
     parallel = adapters.to_pettingzoo(Uneven())
     obs, _ = parallel.reset(seed=1)

@@ -355,7 +355,7 @@ def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
 
 
 @pytest.mark.slow  # MJX compiles it for a minute
-def test_mjx_feels_solid_walls_as_c_does():
+def test_mjx_sees_solid_walls_as_c_does():
     env, step = walled("solid", "mjx")
     states = flight("solid")[:16]
     restore = jax.jit(lambda state: jax.vmap(env.restore)(**jax.vmap(env.raw)(state)))
