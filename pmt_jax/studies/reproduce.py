@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from ..config.methods import METHODS
 from ..errors import UsageError
 from ..tasks import did_you_mean, names
-from ..training.claims import claim
+from ..training import lock
 from . import table
 from .points import Part, Points, make_points
 from .rows import rows
@@ -40,7 +40,7 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     check_tasks(next(iter(points.values())) for points in plans.values())
     with contextlib.ExitStack() as stack:
         for task in plans:
-            stack.enter_context(claim(out / task))
+            stack.enter_context(lock.acquire(out / task))
         missing = [missing_programs(points, out / task, launch.say) for task, points in plans.items()]
         code = train_programs([program for programs in missing for program in programs], launch)
     if code:

@@ -22,9 +22,8 @@ from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
-from ..training import claims, trainer
+from ..training import lock, trainer
 from ..training.checkpoint import Checkpoints, Provenance
-from ..training.claims import claim
 from ..training.run_folder import Rescue, Say, load_saved
 from . import program_folder, table, workers
 from .points import Part, Points, drawn
@@ -56,7 +55,7 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
 
     draws.json holds what was drawn at random.
     """
-    with claim(out):
+    with lock.acquire(out):
         wanted = missing_programs(points, out, launch.say)
         if values := drawn(parts, points):
             seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
@@ -83,7 +82,7 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
     Raises:
       UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
     """
-    with claim(out):
+    with lock.acquire(out):
         programs = missing_programs(points, out, launch.say)
         _check_missing(programs)
         return train_programs(programs, launch)
@@ -150,7 +149,7 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
         spread = workers.gpus() if count is None else ()  # a number of devices means those, for every program
         return workers.run([workers.command(p.folder, p.out, cache, count) for p in programs], at_once, say, spread)
     for title, program in titled:
-        if not claims.is_held(program.out):
+        if not lock.is_held(program.out):
             say(f"stopped: {program.out} was deleted, renamed or replaced meanwhile; what follows is not trained")
             return 1
         say(title)
@@ -217,7 +216,7 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
     how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare, "rescue": Rescue(out, files)}
-    with claim(folder):
+    with lock.acquire(folder):
         code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
         if code == 0:
             code = _finish(folder, group, out, say)
@@ -226,7 +225,7 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
 
 def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) -> int:
     """Cuts a finished group, if its folder is still there; returns the exit code."""
-    if not claims.is_held(folder):
+    if not lock.is_held(folder):
         say(f"stopped: {folder} was deleted, renamed or replaced; its points get no folders in {out}")
         return 1
     _cut(folder, group, out)

@@ -28,7 +28,7 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from . import claims, processes
+from . import lock, processes
 from .checkpoint import Checkpoints, Provenance, Saved, check_name, newest, unpack
 from .history import Row, checkpoint_steps, missing_rows, read_changes
 from .loggers import Jsonl, Logger, open_loggers
@@ -54,7 +54,7 @@ class Rescue:
 
 
 class RunFolder:
-    """The folder of a run that trains here: its claim, settings, versions, rows and the place of its checkpoints.
+    """The folder of a run that trains here: its lock, settings, versions, rows and the place of its checkpoints.
 
     The first process reads and writes. All others must call the same methods at the same points, and get its results;
     if it fails, they end with its exit code.
@@ -66,16 +66,16 @@ class RunFolder:
     """
 
     def __init__(self, setup: Setup, say: Say, rescue: Rescue | None = None) -> None:
-        """A folder for a run of `setup`, which `claim` gives a place; `rescue` is beside that place if None."""
+        """A folder for a run of `setup`, which `acquire` gives a path; `rescue` is next to that path if None."""
         self.path, self.saved = pathlib.Path(), None
         self._setup, self._say, self._rescue = setup, say, rescue
         self._provenance = self._run = Provenance.of(setup)
         self._changes: list[Row] = []
         self._is_edited = False
         self._loggers: list[Logger] = []
-        self._claim, self._open = contextlib.ExitStack(), contextlib.ExitStack()
+        self._lock, self._open = contextlib.ExitStack(), contextlib.ExitStack()
 
-    def claim(self, out: pathlib.Path | None, resume: bool, change: bool = False) -> None:
+    def acquire(self, out: pathlib.Path | None, resume: bool, change: bool = False) -> None:
         """Takes the folder `out`, or a new one if None, until `close`.
 
         Args:
@@ -93,7 +93,7 @@ class RunFolder:
     def _take(self, out: pathlib.Path | None, resume: bool, change: bool) -> tuple[pathlib.Path, Saved | None]:
         self.path = out or create(self._setup)
         _check_path(self.path, resume)
-        self._claim.enter_context(claims.claim(self.path, created=out is None))
+        self._lock.enter_context(lock.acquire(self.path, created=out is None))
         self._home = self.path.absolute()  # the working folder may be renamed
         rescue = self._rescue or Rescue(self.path)
         self._rescue = dataclasses.replace(rescue, of=rescue.of.absolute())
@@ -105,7 +105,7 @@ class RunFolder:
         Raises:
           OSError: what was written last does not fit on the disk.
         """
-        with self._claim:
+        with self._lock:
             self._open.close()
 
     def _check_content(self, resume: bool, change: bool) -> Saved | None:
@@ -174,17 +174,17 @@ class RunFolder:
     # Writing
 
     def check(self) -> None:
-        """Whether the folder is still the one that was claimed, which must be so before anything is written.
+        """Whether the folder is still the one that was locked, which must be so before anything is written.
 
         Raises:
           Gone: it, or the file of its rows, was deleted, renamed or replaced.
         """
         if gone := self._gone():
-            raise claims.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
+            raise lock.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
 
     @processes.in_first
     def _gone(self) -> pathlib.Path | None:
-        if not claims.is_held(self.path):
+        if not lock.is_held(self.path):
             return self.path
         whole = all(logger.is_there for logger in self._loggers if isinstance(logger, Jsonl))
         return None if whole else self.path / "metrics.jsonl"
@@ -270,7 +270,7 @@ class RunFolder:
         """Writes a checkpoint, as `Checkpoints.save`.
 
         Raises:
-          Gone: the folder is no longer the one that was claimed.
+          Gone: the folder is no longer the one that was locked.
         """
         self.check()
         self.checkpoints.save(step, tree, self._provenance)
@@ -324,7 +324,7 @@ def create(setup: Setup) -> pathlib.Path:
 
 
 def _check_path(out: pathlib.Path, resume: bool) -> None:
-    """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
+    """Whether `out` can be a run's folder, as far as that can be said before it is locked.
 
     Raises:
       UsageError: it is a file, has a name that cannot be encoded, or holds no run to resume.

@@ -28,7 +28,7 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import chunks, claims, failures, health, jobs, processes
+from . import chunks, failures, health, jobs, lock, processes
 from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
@@ -91,11 +91,11 @@ def train(
     if profile is not None:
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
-        interrupts = stack.enter_context(Interrupts(say, claims.release_all))
+        interrupts = stack.enter_context(Interrupts(say, lock.release_all))
         with tasks.announcing(say):
             setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
         folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
-        folder.claim(out, resume, change)
+        folder.acquire(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
         _describe(setup, folder.path, say)
         state, programs = _compile(setup, cache, say)
@@ -132,7 +132,7 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
         begin()
         trainer.train(interrupts)
         stack.close()
-    except claims.Gone as gone:
+    except lock.Gone as gone:
         trainer.say(trainer.rescue(gone))
         return 1
     except NotFinite as found:
@@ -294,7 +294,7 @@ class Trainer:
         try:
             with contextlib.suppress(jax.errors.JaxRuntimeError):
                 self._save()
-        except claims.Gone as gone:
+        except lock.Gone as gone:
             return self.rescue(gone)
         except OSError as error:
             return self.write_failure(error)
@@ -448,7 +448,7 @@ class Trainer:
             where = self.folder.path
             self.say(f"seed(s) {seeds} broke; the last finite state and the best of every seed are saved in {where}")
 
-    def rescue(self, gone: claims.Gone) -> str:
+    def rescue(self, gone: lock.Gone) -> str:
         """Saves a run beside its folder that is gone; returns what happened and how to continue."""
         if not self._is_open:
             return f"stopped: {gone}; nothing new was trained yet"

@@ -68,7 +68,7 @@ def test_a_signal_saves_and_the_command_continues(
     monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(number)))
     out = tmp_path / "a b"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
-    assert code == 128 + number and not (out / ".claim").exists()
+    assert code == 128 + number and not (out / ".lock").exists()
     command = re.search(r"interrupted after 200 steps; saved. Continue with: pmt (.*)", text)
     assert command and [p.name for p in (out / "checkpoints").iterdir()] == ["200"]
     monkeypatch.undo()
@@ -202,7 +202,7 @@ def test_a_row_that_is_none_of_a_run(row: str, copy: pathlib.Path, cli):
     metrics.write_text(before := metrics.read_text() + row + "\n")
     code, _, err = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
     assert code == 2 and f"{metrics} holds a row with" in err and "delete that line" in err and err.count("\n") == 1
-    assert metrics.read_text() == before and not (copy / ".claim").exists()
+    assert metrics.read_text() == before and not (copy / ".lock").exists()
 
 
 def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
