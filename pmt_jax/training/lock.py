@@ -98,7 +98,7 @@ def _release(folder: pathlib.Path) -> None:
 
 
 def _open(folder: pathlib.Path, path: pathlib.Path) -> tuple[int, bool]:
-    """The descriptor of the lock file `path`, and whether the system locks it; UsageError if another process has the lock."""
+    """The descriptor of the lock file `path`, and whether the system locks it; UsageError if for another process."""
     import fcntl  # not on every system, and only training needs it
 
     while True:
