@@ -27,8 +27,8 @@ from envs.physics import usable_cpus
 from envs.vector import restart
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
-from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
+from pmt_jax.training.workers import start_workers
 
 from . import grid, once, plain, substep
 from .cases import Bench, Build, Case, Program
@@ -56,7 +56,7 @@ def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str
         await_quiet(6 * effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
-    fits = [case for case in cases if case.devices <= jax.device_count() and case.jobs <= max(2, usable_cpus())]
+    fits = [case for case in cases if case.devices <= jax.device_count() and case.workers <= max(2, usable_cpus())]
     timed = [case for case in fits if case.kind not in ONCE]
     for group in [timed] if bench.by_turns else [[case] for case in timed]:
         programs = _compiled(group, failed, bench.on == "gpus", say)
@@ -152,11 +152,11 @@ def training(case: Case) -> Build:
     engine = {"physics": case.physics} if case.physics else {}
     settings = sizes | engine | {"log_interval": updates, "steps": steps}
     setup = make_setup(load_config(case.task, method=case.method, **settings, **dict(case.settings)))
-    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), jobs=case.jobs)
+    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), workers=case.workers)
 
     def build() -> Program:
         begin = time.perf_counter()
-        state, programs = (jobs.start if case.jobs > 1 else compile_run)(setup, lambda _: None)
+        state, programs = (start_workers if case.workers > 1 else compile_run)(setup, lambda _: None)
         facts = {"physics": setup.vector.env.engine, "compile_seconds": round(time.perf_counter() - begin, 2)}
         box = [state]
 

@@ -217,7 +217,7 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "of reference": _shown("{:.2f}", _of_reference_walls),
     "rule": _shown("{}", "what"),
     "of integral": _shown("{:.3f}", _of_integral),
-    "worker processes": _shown("{}", "jobs"),
+    "worker processes": _shown("{}", "workers"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
     "of plain loops at once": _shown("{:.2f}", _of_as_many_loops),

@@ -127,7 +127,7 @@ def check_system() -> None:
 
 def refuse_many(command: str, jobs: int, devices: int | None) -> None:
     """Refuses to run once in each of several processes, which would write into the same folders."""
-    from ..studies.workers import share_memory
+    from ..studies.jobs import share_memory
     from ..training import processes
 
     processes.make_room(devices)

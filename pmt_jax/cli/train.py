@@ -37,7 +37,7 @@ def add(commands: Any) -> None:
         "--change", action="store_true", help="with --resume: continue with settings other than those of the run"
     )
     output.add_argument(
-        "--sink",
+        "--loggers",
         type=names,
         default=[],
         metavar="NAMES",
@@ -53,7 +53,11 @@ def add(commands: Any) -> None:
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
     hosts.add_argument(
-        "--jobs", type=whole(1), default=1, metavar="N", help="worker processes that share seeds and CPUs (default 1)"
+        "--workers",
+        type=whole(1),
+        default=1,
+        metavar="N",
+        help="processes that share seeds and CPUs (default 1)",
     )
     hosts.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process listens")
     hosts.add_argument("--process", type=whole(0), metavar="I", help="which process this is, from 0")
@@ -90,11 +94,11 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.out,
         arguments.resume,
         cache=not arguments.no_cache,
-        loggers=arguments.sink,
+        loggers=arguments.loggers,
         profile=arguments.profile,
         say=say,
-        count=arguments.devices,
-        workers=arguments.jobs,
+        devices=arguments.devices,
+        workers=arguments.workers,
         warm_start=warm_start.prepare,
         debug=arguments.debug,
         change=arguments.change,

@@ -36,7 +36,7 @@ class Setup:
     """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
 
     With `trials`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
-    With `mesh`, it is split over several devices (see sharding.py). With more than one of `jobs`, so many worker
+    With `mesh`, it is split over several devices (see sharding.py). With more than one of `workers`, so many worker
     processes share its seeds. With `debug`, its program checks that all it computes is finite (see debug.py).
     """
 
@@ -46,7 +46,7 @@ class Setup:
     nets: networks.Networks
     trials: Trials | None = None
     mesh: jax.sharding.Mesh | None = None
-    jobs: int = 1
+    workers: int = 1
     debug: bool = False
 
     @property

@@ -25,7 +25,7 @@ from ..policies import warm_start
 from ..training import lock, trainer
 from ..training.checkpoint import Checkpoints, Provenance
 from ..training.run_folder import Rescue, Say, load_saved
-from . import program_folder, table, workers
+from . import jobs, program_folder, table
 from .points import Part, Points, drawn
 from .rows import rows
 from .run_log import read_all
@@ -37,13 +37,13 @@ class Launch(NamedTuple):
     Attributes:
       cache: keep compiled programs on disk.
       say: prints a line.
-      count: of devices, as for `trainer.train`.
+      devices: how many, as for `trainer.train`.
       at_once: programs that train at a time, each in a process of its own where it is more than one.
     """
 
     cache: bool = True
     say: Say = print
-    count: int | None = None
+    devices: int | None = None
     at_once: int = 1
 
 
@@ -139,21 +139,21 @@ def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Progra
 
 def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
-    cache, say, count, at_once = launch
+    cache, say, devices, at_once = launch
     for program in programs:
         _write_points(program)
     titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
     if at_once > 1:
         for title, program in titled:
             say(f"{title}, {program.out.name}: {', '.join(program.points)}")
-        spread = workers.gpus() if count is None else ()  # a number of devices means those, for every program
-        return workers.run([workers.command(p.folder, p.out, cache, count) for p in programs], at_once, say, spread)
+        spread = jobs.gpus() if devices is None else ()  # a number of devices means those, for every program
+        return jobs.run([jobs.command(p.folder, p.out, cache, devices) for p in programs], at_once, say, spread)
     for title, program in titled:
         if not lock.is_held(program.out):
             say(f"stopped: {program.out} was deleted, renamed or replaced meanwhile; what follows is not trained")
             return 1
         say(title)
-        code = train_program(program.folder, program.out, cache, say, count)
+        code = train_program(program.folder, program.out, cache, say, devices)
         if code:
             return code
     return 0
@@ -199,7 +199,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
+def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, devices: int | None) -> int:
     """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
     group = program_folder.points(folder)
     if not group:
@@ -215,7 +215,13 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
-    how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare, "rescue": Rescue(out, files)}
+    how = {
+        "cache": cache,
+        "say": say,
+        "devices": devices,
+        "warm_start": warm_start.prepare,
+        "rescue": Rescue(out, files),
+    }
     with lock.acquire(folder):
         code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
         if code == 0:

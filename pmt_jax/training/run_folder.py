@@ -348,7 +348,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     """What the results of a run depend on besides its settings."""
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
-    found |= {"devices": setup.mesh.size if setup.mesh else 1, "jobs": setup.jobs}
+    found |= {"devices": setup.mesh.size if setup.mesh else 1, "workers": setup.workers}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 

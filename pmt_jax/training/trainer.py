@@ -28,7 +28,7 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import chunks, failures, health, jobs, lock, processes
+from . import chunks, failures, health, lock, processes
 from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
@@ -36,6 +36,7 @@ from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_inter
 from .progress import Progress, duration
 from .run_folder import MATMUL_PRECISION, Rescue, RunFolder, initial_best
 from .signals import Interrupts
+from .workers import WorkerLost, check_workers, start_workers
 
 CHECKPOINT_SECONDS = 300.0
 WarmStart = Callable[[Setup], Callable[[LearnerState], LearnerState] | None]
@@ -52,7 +53,7 @@ def train(
     profile: pathlib.Path | None = None,
     say: Say = say,
     trials: Trials | None = None,
-    count: int | None = None,
+    devices: int | None = None,
     workers: int = 1,
     warm_start: WarmStart = lambda setup: None,
     debug: bool = False,
@@ -68,9 +69,9 @@ def train(
       loggers: where the rows are written besides metrics.jsonl: csv, tensorboard, wandb.
       profile: a folder for a JAX profiler trace of a few chunks.
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
-      count: of devices to split the run over, of all processes together: one if None, or all of several processes'.
+      devices: how many to split the run over, of all processes together: one if None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
-      workers: processes that share the seeds and the CPUs (see jobs.py).
+      workers: processes that share the seeds and the CPUs (see workers.py).
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
@@ -85,7 +86,7 @@ def train(
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     check_loggers(loggers)
-    jobs.check(config, workers, {"--devices": count, "--debug": debug, "--profile": profile})
+    check_workers(config, workers, {"--devices": devices, "--debug": debug, "--profile": profile})
     if not processes.is_first():
         say, loggers, profile = silent, (), None
     if profile is not None:
@@ -93,7 +94,7 @@ def train(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, lock.release_all))
         with tasks.announcing(say):
-            setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
+            setup = dataclasses.replace(_make_setup(config, trials, devices, debug), workers=workers)
         folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
         folder.acquire(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
@@ -109,16 +110,16 @@ def _compile(setup: Setup, cache: bool, say: Say) -> tuple[LearnerState, Program
     if cache:
         use_cache()
     with failures.named():
-        return (jobs.start if setup.jobs > 1 else compile_run)(setup, say)
+        return (start_workers if setup.workers > 1 else compile_run)(setup, say)
 
 
-def _make_setup(config: Config, trials: Trials | None, count: int | None, debug: bool) -> Setup:
+def _make_setup(config: Config, trials: Trials | None, devices: int | None, debug: bool) -> Setup:
     """The run's setup.
 
     Raises:
       UsageError: `debug` on several devices, or more memory than there is.
     """
-    mesh = sharding.make_mesh(config, count)
+    mesh = sharding.make_mesh(config, devices)
     if debug and mesh:
         raise UsageError("--debug runs on one device in one process; leave out --devices")
     setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
@@ -138,7 +139,7 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
     except NotFinite as found:
         trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
         return 1
-    except (failures.Failed, jobs.Lost) as failure:
+    except (failures.Failed, WorkerLost) as failure:
         trainer.say(f"stopped: {failure}; {trainer.saved}. Continue with: {trainer.command}")
         return 1
     except OSError as error:
@@ -168,8 +169,8 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
             f"{setup.mesh.size} devices in {jax.process_count()} process(es): seeds in {seeds} part(s), "
             f"each seed's environments in {environments}"
         )
-    if setup.jobs > 1:
-        say(f"{setup.jobs} worker processes share the seeds and the CPUs")
+    if setup.workers > 1:
+        say(f"{setup.workers} worker processes share the seeds and the CPUs")
     say(
         f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
         f"{config.num_updates:,} updates = {steps:,} steps a seed"
@@ -478,5 +479,5 @@ class Trainer:
         if jax.process_count() > 1:
             return "the same command with --resume" + f" --out {shlex.quote(str(out))}" * moved
         split = f" --devices {self.setup.mesh.size}" if self.setup.mesh else ""
-        split += f" --jobs {self.setup.jobs}" if self.setup.jobs > 1 else ""
+        split += f" --workers {self.setup.workers}" if self.setup.workers > 1 else ""
         return load.resume_command(str(out)) + split

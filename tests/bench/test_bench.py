@@ -141,7 +141,7 @@ def test_programs_take_turns_and_failures_are_rows(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.full
 def test_workers_share_seeds_and_cpus():
-    case = Case("training", "lane", method="mappo_l", seeds=2, num_envs=4, rollout_length=5, jobs=2)
+    case = Case("training", "lane", method="mappo_l", seeds=2, num_envs=4, rollout_length=5, workers=2)
     program = measure.training(case)()
     assert program.steps == 2 * 4 * 5
     for _ in range(2):

@@ -108,7 +108,7 @@ train lane --preset= | unknown preset ''
 train lane --preset ../presets/smoke | unknown preset '../presets/smoke'
 train --preset smoke | the following arguments are required: TASK|CONFIG
 train lane --eval-episodes 0 --eval-interval 1 | eval_episodes must be at least 1
-train lane --sink csv,csvv | unknown sink 'csvv'; did you mean 'csv'?
+train lane --loggers csv,csvv | unknown logger 'csvv'; did you mean 'csv'?
 train lane --devices 0 | --devices must be a whole number of at least 1, not '0'
 train lane --process 0 | --coordinator, --process, --processes belong together
 train lane --coordinator nowhere --process 0 --processes 2 | --coordinator must be HOST:PORT

@@ -97,8 +97,8 @@ def test_the_same_command_again_trains_nothing_and_shows_the_points_best_first(s
 def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     write = Jsonl.write
 
-    def interrupt(sink: Jsonl, log: list[dict]) -> None:
-        write(sink, log)
+    def interrupt(logger: Jsonl, log: list[dict]) -> None:
+        write(logger, log)
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:

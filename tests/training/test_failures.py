@@ -114,7 +114,7 @@ def test_a_worker_that_fails_says_why(tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sensor.py").write_text(CALLBACK)
     (tmp_path / "offline").touch()
-    words = ("sensor.py", *TINY, "--method", "mappo", "--steps", 2000, "--no-cache", "--seeds", 2, "--jobs", 2)
+    words = ("sensor.py", *TINY, "--method", "mappo", "--steps", 2000, "--no-cache", "--seeds", 2, "--workers", 2)
     code, text, err = cli("train", *words, "--out", "run")
     assert code == 1 and not err
     assert "stopped: a host callback raised RuntimeError: the sensor is offline (sensor.py, line 12); saved as " in text

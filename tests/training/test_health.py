@@ -16,8 +16,9 @@ import pytest
 
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.debug import SEEDS, NotFinite, check_finite, checked, watched
-from pmt_jax.training import health, jobs, trainer
+from pmt_jax.training import health, trainer
 from pmt_jax.training.metrics import LOSSES
+from pmt_jax.training.workers import WorkerLost
 from runs import ARGUMENTS, STEPS, rows, saved
 
 
@@ -74,7 +75,7 @@ def test_a_worker_that_is_lost_after_a_seed_broke_costs_one_chunk(tmp_path: path
 
     def evaluate_until_lost(self: trainer.Trainer, rows: Any) -> None:
         if self.step == 800:
-            raise jobs.Lost("a worker died")
+            raise WorkerLost("a worker died")
         evaluate(self, rows)
 
     monkeypatch.setattr(trainer.Trainer, "_evaluate", evaluate_until_lost)

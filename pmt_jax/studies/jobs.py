@@ -29,9 +29,9 @@ def share_memory() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-def command(folder: pathlib.Path, out: pathlib.Path, cache: bool, count: int | None) -> list[str]:
-    """What a process runs, see `pmt_jax.cli.worker`."""
-    return [sys.executable, "-m", "pmt_jax.cli.worker", str(folder), str(out), str(int(cache)), str(count or "")]
+def command(folder: pathlib.Path, out: pathlib.Path, cache: bool, devices: int | None) -> list[str]:
+    """What a process runs, see `pmt_jax.cli.job`."""
+    return [sys.executable, "-m", "pmt_jax.cli.job", str(folder), str(out), str(int(cache)), str(devices or "")]
 
 
 def gpus() -> tuple[str, ...]:
