@@ -215,15 +215,9 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
-    how = {
-        "cache": cache,
-        "say": say,
-        "devices": devices,
-        "warm_start": warm_start.prepare,
-        "rescue": Rescue(out, files),
-    }
+    how = {"cache": cache, "say": say, "devices": devices, "warm_start": warm_start.prepare}
     with lock.acquire(folder):
-        code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
+        code = trainer.train(common, folder / "run", resume=begun, trials=trials, rescue=Rescue(out, files), **how)
         if code == 0:
             code = _finish(folder, group, out, say)
     return code

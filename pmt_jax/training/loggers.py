@@ -49,7 +49,8 @@ def _check_wandb_key() -> None:
         return
     if not importlib.import_module("wandb").api.api_key:
         raise UsageError(
-            "logger 'wandb' has no key; run wandb login, set WANDB_API_KEY, or set WANDB_MODE=offline to log without"
+            "logger 'wandb' has no key; run wandb login, set WANDB_API_KEY, or set WANDB_MODE=offline to log without "
+            "one"
         )
 
 

@@ -35,7 +35,7 @@ ELSEWHERE = {
     r"pytest": "the first part of .ci/run",
     r"srun|.*--coordinator": "several hosts; tests/training/test_devices.py has several processes",
     r"nvidia-": "an NVIDIA GPU",
-    r".*--loggers wandb": "wandb, which .[dev] does not have; tests/training/test_loggers.py runs it where there is one",
+    r".*--loggers wandb": "wandb, which .[dev] does not have; tests/training/test_loggers.py runs it if it is there",
     r"python -m bench peers": "other programs, which a reader downloads; tests/bench has doubles of them",
     r"python -m bench publish": "replaces policies of the package; tests/policies/test_pretrained.py has a copy",
 }
