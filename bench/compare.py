@@ -9,7 +9,7 @@ from __future__ import annotations
 import collections
 from typing import Any, NamedTuple
 
-from .records import Report, Row
+from .records import Record, Report
 
 LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
@@ -31,7 +31,7 @@ def more_is_better(name: str) -> bool:
     return name.endswith("_second") or name in SHARES
 
 
-def label(row: Row) -> str:
+def label(row: Record) -> str:
     """What a row is about, for people."""
     words = [str(row[name]) for name in SUBJECT if row.get(name)]
     return ", ".join([*words, *(f"{name} {row[name]:,}" for name in SIZES if name in row)])

@@ -32,7 +32,7 @@ from pmt_jax.training.workers import start_workers
 
 from . import grid, once, plain, substep
 from .cases import Bench, Build, Case, Program
-from .records import Row
+from .records import Record
 
 UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
 
@@ -49,7 +49,7 @@ FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 
 
-def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
+def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Record]:
     """Measures cases; if one fails, its row says why."""
     found, failed = {}, Failures()
     for case in [case for case in cases if case.kind in ONCE]:
@@ -66,7 +66,7 @@ def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str
             yield _row(case, found, failed, say)
 
 
-def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[str], None]) -> Row:
+def _row(case: Case, found: dict[Case, Record], failed: Failures, say: Callable[[str], None]) -> Record:
     row = case.about() | ({"failed": failed[case]} if case in failed else found[case])
     say(str({name: value for name, value in row.items() if name != "rates"}))
     return row
@@ -211,7 +211,7 @@ def _turn(program: Program, seconds: float) -> Turn:
     return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
 
 
-def _medians(case: Case, turns: Sequence[Turn]) -> Row:
+def _medians(case: Case, turns: Sequence[Turn]) -> Record:
     unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
     busy = [turn.gpu for turn in turns if turn.gpu is not None]
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none

@@ -87,7 +87,7 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
         records.write(out, rows, f"python -m bench run {name}{flags}")
 
 
-def _wanted(row: records.Row, only: str) -> bool:
+def _wanted(row: records.Record, only: str) -> bool:
     return all(word.strip() in compare.label(row) for word in only.split(","))
 
 

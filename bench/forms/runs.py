@@ -18,7 +18,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
 from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
-from pmt_jax.studies.rows import Row, in_order, rows
+from pmt_jax.studies.rows import TableRow, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import holm, iqm, mean_interval, u_test
 from pmt_jax.tasks import columns
@@ -176,7 +176,7 @@ def as_overview(files: pathlib.Path) -> str:
     return markdown(["", *(f"`{method}`" for method in methods)], body)
 
 
-def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[Row, str]]:
+def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str]]:
     """{(task, label): a row, and its mean reward / cost and how many seeds keep the limit} of files that a + joins."""
     found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
     words = [
@@ -273,11 +273,11 @@ def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     return METHODS[method].constraint == "lagrangian" and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
 
 
-def _row(run: Run) -> Row:
+def _row(run: Run) -> TableRow:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
     limits = Limits((run["cost_limit"],))
-    return Row(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
+    return TableRow(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
 
 
 def _scores(run: Run) -> dict[str, np.ndarray]:

@@ -162,9 +162,9 @@ def run_table(arguments: argparse.Namespace) -> int:
 @at_once()
 def run_compare(arguments: argparse.Namespace) -> int:
     """Prints how two runs differ."""
-    from ..studies import pair
+    from ..studies import compare
 
-    result(pair.compare(arguments.first, arguments.second, arguments.out).removesuffix("\n"))
+    result(compare.compare(arguments.first, arguments.second, arguments.out).removesuffix("\n"))
     if arguments.out:
         say(f"wrote {arguments.out}")
     return 0

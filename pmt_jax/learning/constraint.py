@@ -17,7 +17,7 @@ from ..limits import columns
 from .rollout import finished_mean
 from .schedules import Schedule
 from .setup import Setup, limit_less_margin
-from .types import Batch, Constraint, Hyper, Metrics, PolicyRows
+from .types import Batch, Constraint, Hyper, Metrics, PolicySamples
 
 LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
 
@@ -137,7 +137,7 @@ def respond(
     hyper: Hyper,
     now: Schedule,
     constraint: Constraint,
-    rows: PolicyRows,
+    samples: PolicySamples,
     excess: jax.Array,
     log_ratio: jax.Array,
     reach: jax.Array,
@@ -145,7 +145,7 @@ def respond(
     """One agent's constraint [K] after its policy has changed.
 
     Args:
-      rows: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
+      samples: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
       reach: [] cost per step, the most that a step of the trust region promised to take off the cost.
     """
     if setup.method.constraint == "none":
@@ -153,7 +153,7 @@ def respond(
     if setup.method.constraint == "trust_region":
         lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, now.limit_windup * reach)
         return dataclasses.replace(constraint, lowered=lowered)
-    surrogate = surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
+    surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
     step = excess_in_lambda_unit(setup, hyper, excess + hyper.surrogate_weight * surrogate)
     if setup.config.lambda_unit == "relative":
         lowest = LAMBDA_MIN * hyper.lambda_init

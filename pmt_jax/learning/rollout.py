@@ -198,5 +198,5 @@ def _worst_cost(batch: Batch) -> jax.Array:
 
 
 def flatten_steps(x: jax.Array) -> jax.Array:
-    """[T, B, ...] as rows [R, ...]."""
+    """[T, B, ...] as samples [R, ...]."""
     return x.reshape(-1, *x.shape[2:])

@@ -133,8 +133,8 @@ class Constraint:
 
 
 @pytree
-class PolicyRows:
-    """The rows of a policy update; R = T * B rows, with a leading [N] before an agent is chosen.
+class PolicySamples:
+    """The samples of a policy update; R = T * B samples, with a leading [N] before an agent is chosen.
 
     Attributes:
       obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.

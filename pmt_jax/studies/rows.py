@@ -83,7 +83,7 @@ def columns(tasks: Iterable[str]) -> list[Column]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class TableRow:
     """The seeds of all runs with the same task, method and settings.
 
     Attributes:
@@ -135,10 +135,10 @@ class Row:
         return (not beyond <= 0, math.inf if math.isnan(key) else key)
 
 
-RowOrGroup = TypeVar("RowOrGroup", Row, Group)
+RowOrGroup = TypeVar("RowOrGroup", TableRow, Group)
 
 
-def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[Row]:
+def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[TableRow]:
     """One row per task, method and settings, in the order of the tasks' names and of METHODS.
 
     Args:
@@ -156,12 +156,12 @@ def in_order(rows: Sequence[RowOrGroup]) -> list[RowOrGroup]:
     return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
 
 
-def _row(group: Group) -> Row:
+def _row(group: Group) -> TableRow:
     first, last = group.runs[0], group.runs[-1]
     if len({run.evaluated for run in group.runs}) > 1:
         raise UsageError(f"{first.folder} and {last.folder} cannot share a row: only one was evaluated in training")
     scores = {c.name: group.score(c.metric, c.throughout) for c in columns([group.task])}
-    return Row(
+    return TableRow(
         task=group.task,
         method=group.method,
         settings=group.settings,
@@ -178,7 +178,7 @@ def _row(group: Group) -> Row:
     )
 
 
-def shown(rows: Sequence[Row]) -> list[Column]:
+def shown(rows: Sequence[TableRow]) -> list[Column]:
     """The columns that any row has, in order; true costs only if a run did not observe all of them."""
     every = columns(row.task for row in rows)
     present = [column for column in every if any(column.name in row.scores for row in rows)]
@@ -191,7 +191,7 @@ def same(true: np.ndarray | None, observed: np.ndarray | None) -> bool:
     return true is None or observed is None or np.array_equal(true, observed, equal_nan=True)
 
 
-def compared(rows: Sequence[Row]) -> tuple[str, str]:
+def compared(rows: Sequence[TableRow]) -> tuple[str, str]:
     """The columns that rows are compared by: reward, and the cost as it was, observed or not, of the worst agent."""
     names = [column.name for column in shown(rows)]
     return "reward", next(x for x in ("true worst agent", "true cost", "worst agent", "cost") if x in (*names, "cost"))

@@ -214,7 +214,7 @@ def test_rows_about_the_same_thing_stay_apart():
 
 
 def test_ratios_between_rows_are_taken_turn_by_turn():
-    def row(kind: str, rates: list[float], **more: Any) -> records.Row:
+    def row(kind: str, rates: list[float], **more: Any) -> records.Record:
         return {"kind": kind, "task": "x", "steps_per_second": float(np.median(rates)), "rates": rates, **more}
 
     loops = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]

@@ -12,7 +12,7 @@ import scipy.stats
 from by_hand import made, row, written
 from pmt_jax.limits import Limits
 from pmt_jax.studies import statistics
-from pmt_jax.studies.rows import Row
+from pmt_jax.studies.rows import TableRow
 
 
 def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
@@ -174,9 +174,9 @@ def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
 
 
 def test_the_best_row_is_the_one_with_most_reward_within_the_limit():
-    def row(reward: float, cost: float) -> Row:
+    def row(reward: float, cost: float) -> TableRow:
         scores = {"reward": np.array([reward]), "cost": np.array([cost])}
-        return Row("lane", "happo", "", Limits((1.0,)), 1, "training", scores)
+        return TableRow("lane", "happo", "", Limits((1.0,)), 1, "training", scores)
 
     best = [row(2, 1.0), row(1, 0.0), row(9, 1.5), row(5, 3.0), row(np.nan, np.nan)]
     shuffled = [best[i] for i in (4, 2, 0, 3, 1)]
