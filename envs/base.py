@@ -122,7 +122,7 @@ class Env(Protocol):
         ...
 
 
-Policy = Callable[[State], jax.Array]  # a state of one environment -> action [N, A]
+Controller = Callable[[State], jax.Array]  # a state of one environment -> action [N, A]
 
 
 Raw = Callable[[State], dict[str, Any]]  # the quantities of a state that a picture reads, by name
@@ -197,7 +197,7 @@ class Declarations:
     state: Blocks = ()
     actions: tuple[tuple[str, ...], ...] = ()
     picture: Plain | Scene | NetworkMap = Plain()
-    baselines: Mapping[str, Callable[[], Policy]] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, Callable[[], Controller]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from .errors import UsageError
 
 if TYPE_CHECKING:
-    from envs.base import Env, EnvSpec, Policy, State, declarations, shares_cost
+    from envs.base import Controller, Env, EnvSpec, State, declarations, shares_cost
     from envs.columns import Column
     from envs.vector import Outcome, VectorEnv, VectorState, observed_cost
 
@@ -94,7 +94,7 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     return _envs().errors.did_you_mean(word, choices)
 
 
-def baseline(env: Env, name: str) -> Policy:
+def baseline(env: Env, name: str) -> Controller:
     """A policy that needs no training: state -> action [N, A].
 
     Raises:

@@ -24,7 +24,7 @@ from envs.physics import warp_engine
 from envs.physics.fused import gpu, threads
 from envs.physics.fused.model import tables
 from envs.velocity import robots
-from places import DATA, ROOT
+from paths import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play

@@ -30,21 +30,21 @@ def needed() -> list[Callable[[], Any]]:
     """
     import warp
 
-    place = places()[0]
-    with warp.ScopedDevice(place), _noted() as launches:
+    device = devices()[0]
+    with warp.ScopedDevice(device), _noted() as launches:
         for engine in engines:
             engine.rehearse()
-    return [functools.partial(module.load, place, block_dim=size) for module, size in launches]
+    return [functools.partial(module.load, device, block_dim=size) for module, size in launches]
 
 
-def places() -> list[Any]:
+def devices() -> list[Any]:
     """Warp's devices that are JAX's local ones, in JAX's order; a CPU's host devices are one of Warp's."""
     import warp
 
-    devices = jax.local_devices()
-    if devices[0].platform != "gpu":
+    present = jax.local_devices()
+    if present[0].platform != "gpu":
         return [warp.get_device("cpu")]
-    return [warp.get_cuda_device(device.local_hardware_id) for device in devices]
+    return [warp.get_cuda_device(device.local_hardware_id) for device in present]
 
 
 _HOOKING = threading.Lock()

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from ..base import Policy, State
+from ..base import Controller, State
 
 if TYPE_CHECKING:
     from .control import VoltageControl
@@ -32,12 +32,12 @@ DROOP_SLOPE = 0.44 / 0.06
 DROOP_RESPONSE = 0.5  # share of the way to the curve in one control step; all of it would oscillate
 
 
-def zero(env: VoltageControl) -> Policy:
+def zero(env: VoltageControl) -> Controller:
     """No reactive power."""
     return lambda state: jnp.zeros((env.spec.num_agents, 1), state.obs.dtype)
 
 
-def random(env: VoltageControl) -> Policy:
+def random(env: VoltageControl) -> Controller:
     """Uniform in [-1, 1], drawn from the state's own key."""
 
     def policy(state: State) -> jax.Array:
@@ -53,7 +53,7 @@ def droop(
     dead_band: float = 0.0,
     largest_share: float = 1.0,
     response: float = DROOP_RESPONSE,
-) -> Policy:
+) -> Controller:
     """Volt-var droop on each inverter's own voltage, followed with a first-order lag.
 
     Args:
@@ -74,7 +74,7 @@ def droop(
     return policy
 
 
-def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: float = 20.0) -> Policy:
+def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: float = 20.0) -> Controller:
     """Least line losses with voltages in the band, knowing the row to come and every bus: a bound, not a controller.
 
     Adam on the actions through the differentiable power flow. Leaving the band costs `price` MW per p.u. and bus, from
@@ -103,7 +103,12 @@ def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: 
     return policy
 
 
-POLICIES: dict[str, Callable[[VoltageControl], Policy]] = {"zero": zero, "random": random, "droop": droop, "opf": opf}
+CONTROLLERS: dict[str, Callable[[VoltageControl], Controller]] = {
+    "zero": zero,
+    "random": random,
+    "droop": droop,
+    "opf": opf,
+}
 
 
 def q_to_action(env: VoltageControl, state: State, q: jax.Array) -> jax.Array:

@@ -33,7 +33,7 @@ from ..base import Declarations, EnvSpec, NetworkMap, State
 from ..blocks import Block, Blocks, length
 from ..errors import TaskError, at_least, one_of, typed
 from . import power_flow
-from .baselines import POLICIES
+from .baselines import CONTROLLERS
 from .layout import layout
 from .power_flow import Network, PowerFlow
 from .profiles import ROWS_PER_DAY, Profiles, load_profiles
@@ -248,7 +248,7 @@ class VoltageControl:
             picture=NetworkMap(
                 self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"]), unit="p.u."
             ),
-            baselines={name: functools.partial(make, self) for name, make in POLICIES.items()},
+            baselines={name: functools.partial(make, self) for name, make in CONTROLLERS.items()},
         )
 
     def reset(self, key: jax.Array) -> State:

@@ -16,7 +16,7 @@ from .maths import distributions
 from .setup import limit_less_margin
 from .types import Batch, Hyper, RolloutState
 
-Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
+GaussianPolicy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
 Normalise = Callable[[jax.Array], jax.Array]
 ObserveCost = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K], the step's number -> observed cost
 
@@ -47,7 +47,7 @@ def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutSta
 def collect(
     vector: VectorEnv,
     state: RolloutState,
-    policy: Policy,
+    policy: GaussianPolicy,
     normalise: tuple[Normalise, Normalise],
     key: jax.Array,
     steps: int,

@@ -26,7 +26,7 @@ from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
-IDENTITY = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
+REQUIRED = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
 TEXT = ("broken",)  # besides
 
 
@@ -278,7 +278,7 @@ def _config(file: pathlib.Path) -> Config:
 
 def _check(row: dict[str, Any], file: pathlib.Path) -> None:
     """Raises UsageError if a row's identity is missing or of the wrong type."""
-    for name, kind in IDENTITY.items():
+    for name, kind in REQUIRED.items():
         value = row.get(name)
         words = {int: "a whole number", str: "a word", float: "a number"}[kind]
         fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
@@ -297,7 +297,7 @@ def _metrics(
     for row in rows:
         place = seed_at[row["seed"]], step_at[row["step"]]
         for name, value in row.items():
-            if name in IDENTITY or name in TEXT:
+            if name in REQUIRED or name in TEXT:
                 continue
             if name not in found:
                 found[name] = np.full((len(seeds), len(steps)), np.nan)

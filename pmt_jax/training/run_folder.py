@@ -35,7 +35,7 @@ from .loggers import Jsonl, Logger, open_loggers
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 # What --change keeps: who the run is, and what is read at its start only.
-IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
+FIXED = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
@@ -80,7 +80,7 @@ class RunFolder:
 
         Args:
           resume: it holds a run to continue, which `saved` is then of; otherwise it must hold none.
-          change: the settings may differ from that run's, all but `IDENTITY`.
+          change: the settings may differ from that run's, all but `FIXED`.
 
         Raises:
           UsageError: another process has it, it holds something else, or the run was made with other settings, on
@@ -125,7 +125,7 @@ class RunFolder:
         return saved
 
     def _same_settings(self, saved: Saved | None, change: bool) -> None:
-        """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
+        """Only `steps` may change when a run is continued; with `change` all settings but FIXED."""
         file = self.path / "config.toml"
         self._run, edited = Provenance(load_config(file)), {}
         if saved and saved.provenance:
@@ -133,7 +133,7 @@ class RunFolder:
             config = saved.provenance.config if edited else self._run.config
             self._run = Provenance(config, saved.provenance.trials)
         changed = self._run.differences(self._provenance)
-        refused = {name: x for name, x in changed.items() if name in IDENTITY or not change}
+        refused = {name: x for name, x in changed.items() if name in FIXED or not change}
         self._is_edited = bool(edited)
         if edited and not changed:
             self._say(

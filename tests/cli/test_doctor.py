@@ -11,7 +11,7 @@ from importlib import metadata
 import pytest
 
 from envs.physics import contract
-from places import ROOT
+from paths import ROOT
 from pmt_jax import tasks
 from pmt_jax.cli import doctor
 from pmt_jax.render import gl

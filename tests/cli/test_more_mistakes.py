@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from by_hand import row, written
-from places import ROOT
+from paths import ROOT
 from pmt_jax.errors import UsageError
 from pmt_jax.files import writing
 from pmt_jax.training import trainer

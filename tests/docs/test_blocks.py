@@ -20,7 +20,7 @@ import pytest
 
 from bench.__main__ import main as bench
 from by_hand import made
-from places import DATA, ROOT
+from paths import DATA, ROOT
 from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.render import gl

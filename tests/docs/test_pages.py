@@ -8,7 +8,7 @@ import re
 import pytest
 
 from bench import render
-from places import ROOT
+from paths import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bench.forms import tables
-from places import ROOT
+from paths import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments

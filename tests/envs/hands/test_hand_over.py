@@ -16,7 +16,7 @@ import envs
 from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
-from places import ROOT
+from paths import ROOT
 
 CATCH = ROOT / "bench" / "results" / "hand_over_catch.json"
 COUNT = 1000  # starts of the session's batch; the action 0 is the middle of all ranges, a half-flexed hand

@@ -15,7 +15,7 @@ from envs.errors import TaskError
 from envs.vector import VectorEnv
 from envs.velocity import VARIANTS, robots
 from native import compiled
-from places import DATA
+from paths import DATA
 
 NAMES = [f"velocity_{variant}" for variant in VARIANTS]
 PLACES = ("torso_xpos", "com")  # what `restore` takes beside qpos, of the robots that have it
