@@ -1,7 +1,7 @@
 """Results against older ones: which figures became better or worse, and by how much.
 
-A figure is told from its name's ending (bench/records.py): rates should be large, seconds and bytes small. Only results
-of the same kind of device are compared, on a CPU also of the same CPU and number of threads.
+The ending of a figure's name says which way is better (bench/records.py): rates should be large, seconds and bytes
+small. Only results of the same kind of device are compared, on a CPU also of the same CPU and number of threads.
 """
 
 from __future__ import annotations

@@ -95,7 +95,9 @@ def checkpoint(case: Case) -> Record:
         box[0], _ = programs.chunk(box[0], 1)
 
     def keep() -> None:
-        box[1] = run_folder.Best(programs.take(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)
+        box[1] = run_folder.Best(
+            programs.where_seed(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost
+        )
 
     chunk, copy = ([_seconds(work, box) for _ in range(CHUNKS)] for work in (train, keep))
     saved = {"last": box[0], "best": box[1]}

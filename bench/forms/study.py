@@ -212,7 +212,7 @@ def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
         bound = float(cells["mappo_l"][measure].std(ddof=1)) / 2
         inside = abs(middle) + half <= bound
         p = u_test(cells["r4sg"][measure], cells["mappo_l"][measure])
-        answer = "equivalent" if inside else "different" if p < 0.05 else "not told apart"
+        answer = "equivalent" if inside else "different" if p < 0.05 else "not distinguished"
         body.append(
             [name, f"{middle:+.2f} [{middle - half:.2f}, {middle + half:.2f}]", f"+- {bound:.2f}", p_value(p), answer]
         )

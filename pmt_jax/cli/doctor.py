@@ -17,7 +17,7 @@ from ..output import result
 from ..probe import run_python
 from ..render import gl
 from .parser import command
-from .process import at_once, system_obstacle
+from .process import interruptible, system_obstacle
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 EXTRAS = {  # which of our extras brings an optional package
@@ -59,7 +59,7 @@ def add(commands: Any) -> None:
     command(commands, "doctor", run, "check versions, devices, engines and packages of this machine")
 
 
-@at_once()
+@interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Prints all findings."""
     del arguments

@@ -88,7 +88,7 @@ def _print(name: str, sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def at_once() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """Ctrl-C ends the process at once, for commands or moments that leave nothing half written.
 
     As an exception it would be lost in JAX's callbacks, wait for the compiler, or leave half a module imported. XLA's

@@ -15,7 +15,7 @@ from ..output import say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
 from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
-from .process import at_once, check_system
+from .process import check_system, interruptible
 
 
 def add(commands: Any) -> None:
@@ -64,7 +64,7 @@ def add(commands: Any) -> None:
     hosts.add_argument("--processes", type=whole(1), metavar="N", help="how many there are")
 
 
-@at_once()
+@interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
     with trusting(arguments.trust):

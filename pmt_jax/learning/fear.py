@@ -32,7 +32,7 @@ def appraise_fear(
         signal = setup.method.cost_signal
         return None, signal(batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
-    net = dataclasses.replace(net, params=setup.nets.awaken_fear(net.params, batch.cost.mean((0, 1))))
+    net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, batch.cost.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     samples = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
     noise = jax.random.logistic(jax.random.fold_in(key, 2), samples[1].shape)

@@ -117,7 +117,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.side_by_side(
+    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
         partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
         partial(regret.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
     )
@@ -144,7 +144,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     held = dataclasses.replace(held, estimate=estimate)
-    fitted = sharding.side_by_side(
+    fitted = sharding.in_parallel(
         partial(fit_critic, state.critic, setup.nets.value, hyper.clip, samples, tagged[Tag.CRITIC]),
         partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_samples, tagged[Tag.COST_CRITIC]),
         partial(update_policies, setup, hyper, now, state.actor, held, actor_samples, excess, tagged),

@@ -93,7 +93,7 @@ def save(name: str, config: Config, state: ActingState, facts: dict[str, Any]) -
     )
 
 
-def tell(name: str, facts: dict[str, Any]) -> None:
+def store_facts(name: str, facts: dict[str, Any]) -> None:
     """Replaces the facts that `about` returns.
 
     Raises:

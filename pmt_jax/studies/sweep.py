@@ -38,13 +38,13 @@ class Launch(NamedTuple):
       cache: keep compiled programs on disk.
       say: prints a line.
       devices: how many, as for `trainer.train`.
-      at_once: programs that train at a time, each in a process of its own where it is more than one.
+      jobs: programs that train at a time, each in a process of its own where it is more than one.
     """
 
     cache: bool = True
     say: Say = print
     devices: int | None = None
-    at_once: int = 1
+    jobs: int = 1
 
 
 ONE_AT_A_TIME = Launch()
@@ -139,15 +139,15 @@ def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Progra
 
 def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
-    cache, say, devices, at_once = launch
+    cache, say, devices, at_a_time = launch
     for program in programs:
         _write_points(program)
     titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
-    if at_once > 1:
+    if at_a_time > 1:
         for title, program in titled:
             say(f"{title}, {program.out.name}: {', '.join(program.points)}")
         spread = jobs.gpus() if devices is None else ()  # a number of devices means those, for every program
-        return jobs.run([jobs.command(p.folder, p.out, cache, devices) for p in programs], at_once, say, spread)
+        return jobs.run([jobs.command(p.folder, p.out, cache, devices) for p in programs], at_a_time, say, spread)
     for title, program in titled:
         if not lock.is_held(program.out):
             say(f"stopped: {program.out} was deleted, renamed or replaced meanwhile; what follows is not trained")

@@ -44,8 +44,8 @@ def render(table: Sequence[TableRow], form: str = "text", baseline: str | None =
         everything = {"rows": data, "baseline": baseline, "all_tasks": together, "notes": notes}
         return json.dumps(everything, indent=1) + "\n"
     for label, better in together.items():
-        told = ", ".join(f"P({name}) {_interval(found, 'probability')}" for name, found in better.items())
-        notes.append(f"All tasks together, {label}: {told}.")
+        listed = ", ".join(f"P({name}) {_interval(found, 'probability')}" for name, found in better.items())
+        notes.append(f"All tasks together, {label}: {listed}.")
     return formats.write(*_cells(table, data, baseline, test), form, notes)
 
 

@@ -39,14 +39,14 @@ class Programs(NamedTuple):
     Attributes:
       chunk: state, updates -> the state so many updates later, and metrics [seeds, chunks.most(config)], of which the
         first `updates` count, with those of `_health`, [seeds]. Any number up to that runs the same program.
-      take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
+      where_seed: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
       evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       measures: the names of these metrics.
       close: ends what runs beside this process for them.
     """
 
     chunk: Callable[[LearnerState, int], tuple[LearnerState, Metrics]]
-    take: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
+    where_seed: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
     evaluate: Callable[[LearnerState], Metrics] | None = None
     measures: tuple[str, ...] = ()
     close: Callable[[], object] = lambda: None
@@ -144,7 +144,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     with sharding.use_mesh(setup.mesh), cache_events() as events:
         one = np.int32(1)
         compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(_options())
-    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(take, donate_argnums=1))
+    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(where_seed, donate_argnums=1))
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
@@ -246,6 +246,6 @@ def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callab
     return jax.vmap(function, axes, axis_name=axis_name, spmd_axis_name=sharding.SEED if setup.mesh else None)
 
 
-def take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
+def where_seed(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
     """See `Programs`."""
     return jax.vmap(lambda yes, x, y: jax.tree.map(functools.partial(jnp.where, yes), y, x))(chosen, old, new)

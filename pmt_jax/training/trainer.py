@@ -328,7 +328,9 @@ class Trainer:
             rows = self._end_row()
         if self.broken:
             broken = np.array([i in self.broken for i in range(self.config.seeds)])
-            state = self.programs.take(broken, state, self._row_start)  # which stays whole: `train` may go back to it
+            state = self.programs.where_seed(
+                broken, state, self._row_start
+            )  # which stays whole: `train` may go back to it
         self.state = state
         if rows:
             self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, self._row.updates
@@ -384,7 +386,7 @@ class Trainer:
         best_reward, best_cost = np.asarray(self.best.reward), np.asarray(self.best.cost)
         improved = is_better(reward, cost, best_reward, best_cost, limit)
         if improved.any():
-            state = self.programs.take(improved, self.best.state, self.state)
+            state = self.programs.where_seed(improved, self.best.state, self.state)
             self.best = Best(state, np.where(improved, reward, best_reward), np.where(improved, cost, best_cost))
 
     @property
@@ -393,7 +395,7 @@ class Trainer:
         state = self.state
         lost = ~np.asarray(self._row.metrics.get("finite", np.ones(self.config.seeds, bool)))
         if lost.any():  # the end of the row will say why
-            state = self.programs.take(lost, jax.tree.map(jnp.copy, state), self._row_start)
+            state = self.programs.where_seed(lost, jax.tree.map(jnp.copy, state), self._row_start)
         row = dict(self._row.metrics) | {"seconds": np.full(self.config.seeds, self.seconds)}
         return {"last": state, "best": self.best, "row": row}
 

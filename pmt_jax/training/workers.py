@@ -29,7 +29,7 @@ from ..learning.types import LearnerState
 from ..output import Say
 from . import failures, processes
 from .checkpoint import pack, unpack
-from .compile import Programs, compile_run, take
+from .compile import Programs, compile_run, where_seed
 from .run_folder import state_like
 from .signals import CAUGHT
 
@@ -84,7 +84,7 @@ def start_workers(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
         workers.close()
         raise
     say(said[0])
-    programs = Programs(functools.partial(workers.call, "chunk"), jax.jit(take), close=workers.close)
+    programs = Programs(functools.partial(workers.call, "chunk"), jax.jit(where_seed), close=workers.close)
     if config.eval_interval:
         programs = programs._replace(evaluate=functools.partial(workers.call, "evaluate"), measures=measures[0])
     return workers.together(states), programs

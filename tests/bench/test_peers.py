@@ -78,5 +78,5 @@ def test_a_report_leaves_out_what_is_unknown(tmp_path: pathlib.Path):
 
 
 def test_every_peer_says_what_its_update_is():
-    told = [row(peer, {}, [{"failed": "x"}]) for peer in PEERS.values()]
-    assert len({peer["name"] for peer in told}) == len(PEERS) == 7 and all(peer["networks"] for peer in told)
+    found = [row(peer, {}, [{"failed": "x"}]) for peer in PEERS.values()]
+    assert len({peer["name"] for peer in found}) == len(PEERS) == 7 and all(peer["networks"] for peer in found)

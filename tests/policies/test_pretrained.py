@@ -142,10 +142,10 @@ def test_a_policy_of_the_package(name: str):
 
 
 def test_what_is_told_about_them_and_how_large_they_are():
-    told = publish.rows()
-    assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == told
-    assert tables.hub({"hub": {"rows": told}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
-    assert sum(row["bytes"] for row in told) < 4e6
+    found = publish.rows()
+    assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == found
+    assert tables.hub({"hub": {"rows": found}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
+    assert sum(row["bytes"] for row in found) < 4e6
 
 
 def test_their_checksums_are_those_of_their_files():
@@ -230,15 +230,15 @@ def test_packing_costs_no_reward_and_no_safety():
 def test_a_trained_ant_runs_as_it_is_told():
     """Other episodes than the published ones, on the C engine: the two intervals meet."""
     [row] = evaluate.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")
-    (ours, half), told = row["episode_reward"], hub.about("hub:ant_2x4/mappo_l")["figures"]
-    assert abs(ours - told["episode_reward"][0]) <= half + told["episode_reward"][1]
+    (ours, half), stored = row["episode_reward"], hub.about("hub:ant_2x4/mappo_l")["figures"]
+    assert abs(ours - stored["episode_reward"][0]) <= half + stored["episode_reward"][1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_every_policy_is_as_good_as_it_is_told(name: str):
-    told = hub.about(name)
-    [row] = evaluate.evaluate_run(pathlib.Path(name), told["episodes"], True)
+    stored = hub.about(name)
+    [row] = evaluate.evaluate_run(pathlib.Path(name), stored["episodes"], True)
     for figure in ("episode_reward", "episode_cost"):
-        mean, half = told["figures"][figure]
+        mean, half = stored["figures"][figure]
         assert abs(row[figure][0] - mean) <= half + row[figure][1]

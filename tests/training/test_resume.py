@@ -155,10 +155,10 @@ def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
 def test_a_checkpoint_from_before_a_task_told_more_is_still_good(whole: pathlib.Path):
     state = load.load_run(whole)[1]
     packed = checkpoint.pack(state)
-    (told,) = [path for path in packed if ".env.info[" in path]
-    older = {path: x for path, x in packed.items() if path != told}
-    after = checkpoint.pack(checkpoint.unpack(older | {told.replace("position", "forgotten"): packed[told]}, state))
-    assert after.keys() == packed.keys() and not after[told].any()
+    (entry,) = [path for path in packed if ".env.info[" in path]
+    older = {path: x for path, x in packed.items() if path != entry}
+    after = checkpoint.pack(checkpoint.unpack(older | {entry.replace("position", "forgotten"): packed[entry]}, state))
+    assert after.keys() == packed.keys() and not after[entry].any()
     assert all(np.array_equal(after[path], x) for path, x in older.items())
     with pytest.raises(UsageError, match="another kind of run: it differs in .*multiplier"):
         checkpoint.unpack({path: x for path, x in packed.items() if "multiplier" not in path}, state)
