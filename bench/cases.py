@@ -147,7 +147,7 @@ ROBOTS = tuple(
 
 BENCHES = {
     "ant": Bench(
-        "ant: control steps/s per engine beside plain loops, alone and training; seconds to start; memory, GB",
+        "ant: control steps/s per engine next to plain loops, alone and training; seconds to start; memory, GB",
         (
             *(Case("start", "ant_2x4", what, method="mappo_l") for what in ("empty cache", "second start")),
             Case("start", "ant_2x4", "256 x 64", method="mappo_l", num_envs=256, rollout_length=64),
@@ -182,7 +182,7 @@ BENCHES = {
         _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(
-        "hands: control steps/s per engine beside plain loops; CPU-seconds to compile",
+        "hands: control steps/s per engine next to plain loops; CPU-seconds to compile",
         (
             *_plain("hand_over_2x6"),
             *_alone("hand_over_2x6", (64, 256), physics="mujoco"),
@@ -191,7 +191,7 @@ BENCHES = {
         (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
     ),
     "velocity": Bench(
-        "velocity tasks: control steps/s of each robot per engine beside plain loops",
+        "velocity tasks: control steps/s of each robot per engine next to plain loops",
         tuple(
             case
             for task in ROBOTS
@@ -217,7 +217,7 @@ BENCHES = {
         _ruled("switch", *_LIKE_THE_ANT),
     ),
     "grid": Bench(
-        "power flows/s beside other tools; environment steps/s in a scan and with a call a step",
+        "power flows/s next to other tools; environment steps/s in a scan and with a call a step",
         (
             *(
                 Case("power flow", network, what, num_envs=batch)

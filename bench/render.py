@@ -3,7 +3,7 @@
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
 bench/forms/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` means the
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
-`paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks,
+`paper:FILE` for means and standard deviations next to the paper's, `summary:FILE+FILE` for methods by tasks,
 `overview:FILE+FILE` for tasks by methods with PID, `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each
 pair of methods. The study's forms are in bench/forms/study.py and rounds.py; those of tasks, settings and methods, as
 `observation:ant_2x4`, in pages.py.

@@ -25,7 +25,7 @@ PROBE = "import jax; print(jax.device_count(), jax.devices()[0].device_kind)"
 
 
 def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: int, only: str, say: Say) -> int:
-    """Runs benches one after the other, then shows their figures beside those of the last commit.
+    """Runs benches one after the other, then shows their figures next to those of the last commit.
 
     Args:
       names: of benches; none for all that this machine has the devices for.

@@ -162,7 +162,7 @@ def of_agents(known: Mapping[str, Any], name: str) -> list[Any]:
 
 
 def base(name: str) -> str:
-    """The column beside which `columns` puts this one; the name itself if none.
+    """The column next to which `columns` puts this one; the name itself if none.
 
     Examples:
       >>> base("lambda/agent_1/cost_0"), base("cost_limit/0"), base("critic/loss")

@@ -1,4 +1,4 @@
-"""The tables of the study's second and third rounds: cells beside the one they are compared with, candidates beside
+"""The tables of the study's second and third rounds: cells with the one they are compared with, candidates next to
 their criteria.
 
 Cells are read at a common update, as the preregistration says: in the second round the last that all cells of the task
@@ -100,7 +100,7 @@ def as_candidate_late(file: pathlib.Path) -> str:
 
 
 def as_candidate_a(file: pathlib.Path) -> str:
-    """Question b in the third round: candidate A against the same criteria, beside cells of the second round."""
+    """Question b in the third round: candidate A against the same criteria, next to cells of the second round."""
     found = [run for run in runs.load(file) if settings(run)["emotion_lr"] == A["emotion_lr"]] + _second(file)
     body = _while_training(found, ("voltage_33", "hand_over_2x6"), A)
     body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), A)
@@ -122,7 +122,7 @@ def as_candidate_half_life(file: pathlib.Path) -> str:
         p = u_test(halving[name], without[name])
         worse = p < 0.05 and sign * (halving[name].mean() - without[name].mean()) > 0
         text = f"{mean_sd(halving[name])}; {mean_sd(without[name])}; p {p_value(p)}"
-        body.append(["4", f"MAPPO-L's {what} at the end, beside a constant learning rate's, p = 1", text, not worse])
+        body.append(["4", f"MAPPO-L's {what} at the end, against a constant learning rate's, p = 1", text, not worse])
     return _as_criteria(body, "with `lr_half_life` 2e5")
 
 
@@ -135,11 +135,11 @@ def as_candidate_d(file: pathlib.Path) -> str:
 
 
 def as_fourth(file: pathlib.Path) -> str:
-    """Cells of the fourth and the sixth round, those of one task and p beside MAPPO-L; question f has its own table."""
+    """Cells of the fourth and the sixth round, those of one task and p next to MAPPO-L, without question f."""
     found = [run for run in runs.load(file) if run["task"] != "ant_4x2"]
     groups = dict.fromkeys((run["task"], share(run)) for run in found)
     cells = [[run for run in found if (run["task"], share(run)) == group] for group in groups]
-    return beside([_first(same, method="mappo_l") for same in cells])
+    return compared([_first(same, method="mappo_l") for same in cells])
 
 
 def as_fifth(file: pathlib.Path) -> str:
@@ -153,8 +153,8 @@ def as_fifth(file: pathlib.Path) -> str:
 
 
 def as_power(file: pathlib.Path) -> str:
-    """Question f: F4SG beside MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
-    return beside([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
+    """Question f: F4SG against MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
+    return compared([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
 
 
 def _while_training(
@@ -197,7 +197,7 @@ def _at_the_end(
         above, below = u_test(own["end"], usual["end"]), u_test(own["end"], base["end"])
         worse = above < 0.05 and probability_of_improvement([own["end"]], [usual["end"]]) > 0.5
         what = f"{ends[0]}; {ends[1]}; p {p_value(above)}"
-        body.append(["2", f"true cost at the end beside F4SG's, {at}", what, not worse])
+        body.append(["2", f"true cost at the end against F4SG's, {at}", what, not worse])
         what = f"{ends[0]}; {ends[2]}; p {p_value(below)}"
         lower = below < 0.01 and probability_of_improvement([own["end"]], [base["end"]]) < 0.5
         body.append(["2", f"true cost at the end below MAPPO-L's, {at}", what, lower])
@@ -226,14 +226,14 @@ def as_lag_in_time(file: pathlib.Path) -> str:
 
 
 def as_half_life(file: pathlib.Path) -> str:
-    """Question b in the third round: a half-life on the grid, beside MAPPO-L with it at the same p."""
+    """Question b in the third round: a half-life on the grid, next to MAPPO-L with it at the same p."""
     found = [run for run in runs.load(file) if settings(run)["lr_half_life"] == 2e5]
     groups = [[x for x in found if share(x) == seen] for seen in (1.0, 0.05)]
-    return beside([_first(cells, method="mappo_l") for cells in groups])
+    return compared([_first(cells, method="mappo_l") for cells in groups])
 
 
 def as_batch(file: pathlib.Path) -> str:
-    """Question a in the third round: MAPPO-L with four times the environments, beside the first and the second round.
+    """Question a in the third round: MAPPO-L with four times the environments, next to the first and the second round.
 
     Rows are read at the same number of updates, so the larger batch has had four times the steps.
     """
@@ -241,25 +241,25 @@ def as_batch(file: pathlib.Path) -> str:
     first = runs.load(file.with_name("study_ant_2x4_h200.json"))
     usual = {"method": "mappo_l", "lambda_kp": 0.0, "lambda_init": 2.0}
     pairs = [[_cell(found, "ant_2x4", 0.03, **cell) for cell in (AS_IT_IS, usual)] for found in (_second(file), first)]
-    return beside([[*pair, batch] for pair in pairs])
+    return compared([[*pair, batch] for pair in pairs])
 
 
 def as_sway(file: pathlib.Path) -> str:
-    """Question e: a corridor that moves, seen and hidden; F4SG and R4SG beside MAPPO-L."""
+    """Question e: a corridor that moves, seen and hidden; F4SG and R4SG against MAPPO-L."""
     found = [run for run in runs.load(file) if settings(run)["sway"] != "none"]
     groups = [[x for x in found if settings(x)["sway"] == sway] for sway in ("seen", "hidden")]
-    return beside([_first(cells, method="mappo_l") for cells in groups])
+    return compared([_first(cells, method="mappo_l") for cells in groups])
 
 
 def as_responses(file: pathlib.Path) -> str:
-    """Question c under noise: the variants of R4SG on the grid beside MAPPO-L of the second round."""
+    """Question c under noise: the variants of R4SG on the grid against MAPPO-L of the second round."""
     variants = [run for run in runs.load(file) if run["method"] == "r4sg" and run["task"] == "voltage_33"]
-    return beside([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
+    return compared([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
 
 
 def as_prior(file: pathlib.Path) -> str:
-    """Question d: F4SG with the fear of another task from the first step on, beside F4SG that starts afresh."""
-    return beside([_prior_last(file)])
+    """Question d: F4SG with the fear of another task from the first step on, next to F4SG that starts afresh."""
+    return compared([_prior_last(file)])
 
 
 def as_prior_in_time(file: pathlib.Path) -> str:
@@ -275,27 +275,27 @@ def as_prior_in_time(file: pathlib.Path) -> str:
 
 
 def as_beside_mappo_l(file: pathlib.Path) -> str:
-    """All cells of a file beside MAPPO-L, at the last update that all of them reached."""
-    return beside([_first(runs.load(file), method="mappo_l")])
+    """All cells of a file next to MAPPO-L, at the last update that all of them reached."""
+    return compared([_first(runs.load(file), method="mappo_l")])
 
 
 def as_beside_f4sg(file: pathlib.Path) -> str:
-    """All cells of a file beside F4SG, at the last update that all of them reached."""
-    return beside([_first(runs.load(file), method="f4sg")])
+    """All cells of a file next to F4SG, at the last update that all of them reached."""
+    return compared([_first(runs.load(file), method="f4sg")])
 
 
 def as_unclipped(file: pathlib.Path) -> str:
-    """Limits: cells without a clip on cost values beside those of the same method, rule and limit with it."""
+    """Limits: cells without a clip on cost values next to those of the same method, rule and limit with it."""
     return _beside_their_like(file, "limits_pid_h200", "limits_control_h200", "limits_macpo_02_h200")
 
 
 def as_less_noise(file: pathlib.Path) -> str:
-    """Limits: cells with less noise at the end beside those of the same method, rule and limit without it."""
+    """Limits: cells with less noise at the end next to those of the same method, rule and limit without it."""
     return _beside_their_like(file, "limits_unclipped_h200")
 
 
 def as_after_less_noise(file: pathlib.Path) -> str:
-    """Limits: cells of a later form beside those of less noise, each at its own end."""
+    """Limits: cells of a later form next to those of less noise, each at its own end."""
     return _beside_their_like(file, "limits_less_noise_h100", read=_at_their_ends)
 
 
@@ -319,7 +319,7 @@ def as_noise_in_time(file: pathlib.Path) -> str:
 
 
 def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> str:
-    """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit.
+    """Each cell of `file` next to the one of the files `names` that has its method, multiplier's rule and limit.
 
     One without its like is alone.
     """
@@ -329,14 +329,14 @@ def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> s
         return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
 
     like = {cell(run): run for run in found}
-    return beside([[*filter(None, [like.get(cell(run))]), run] for run in runs.load(file)], read)
+    return compared([[*filter(None, [like.get(cell(run))]), run] for run in runs.load(file)], read)
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
 
-def beside(groups: Sequence[Sequence[runs.Run]], read: Read = _read) -> str:
+def compared(groups: Sequence[Sequence[runs.Run]], read: Read = _read) -> str:
     """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure.
 
     Groups of several tasks have a column for the task.

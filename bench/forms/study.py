@@ -133,9 +133,9 @@ def _fear_beside(found: Sequence[runs.Run], run: runs.Run) -> int:
 
 
 def as_lag(file: pathlib.Path) -> str:
-    """Questions b and c, second part: each cell beside the reference cells, with Welch's interval of the difference.
+    """Questions b and c, second part: each cell against the reference cells, with Welch's interval of the difference.
 
-    Cells of question a that belong to it are read up to the last step of the cell beside them.
+    Cells of question a that belong to it are read up to the last step of the cell next to them.
     """
     new = runs.load(file)
     until = {run["task"]: max(run["steps"]) for run in new}
@@ -185,7 +185,7 @@ def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
 
 
 def as_equivalence(file: pathlib.Path) -> str:
-    """Question c, first part: R4SG less MAPPO-L at p = 1, beside half of MAPPO-L's standard deviation."""
+    """Question c, first part: R4SG less MAPPO-L at p = 1, next to half of MAPPO-L's standard deviation."""
     return _equivalence({run["method"]: measures(run) for run in runs.load(file) if share(run) == 1})
 
 
@@ -220,7 +220,7 @@ def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
 
 
 def as_probe(file: pathlib.Path) -> str:
-    """Probes of F4SG beside MAPPO-L with the same settings, at the same p and limit.
+    """Probes of F4SG against MAPPO-L with the same settings, at the same p and limit.
 
     p of each comparison is corrected over all comparisons of the file, those of the three measures together.
     """

@@ -311,8 +311,8 @@ def hub(reports: Reports) -> str:
     return f"{markdown(head, body)}\n\n{len(rows)} policies, {total / 1000:.0f} kB in all."
 
 
-def beside(reports: Reports) -> str:
-    """Speed in five rows, beside what one would use instead, and where and when each was measured."""
+def alternatives(reports: Reports) -> str:
+    """Speed in five rows, next to what one would use instead, and where and when each was measured."""
     ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
     (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
     (alone,) = matching(ant["rows"], kind="environment", physics="mujoco", num_envs=256)
@@ -337,7 +337,7 @@ def beside(reports: Reports) -> str:
 
 
 def limits(reports: Reports) -> str:
-    """Training beside its environment alone, if both were measured at the same size."""
+    """Training next to its environment alone, if both were measured at the same size."""
     ant, engines, loop, scaling = (
         reports[name]["rows"] for name in ("ant", "engines_h200", "loop_h200", "scaling_h200")
     )
@@ -368,7 +368,7 @@ def limits(reports: Reports) -> str:
 
 
 def side_by_side(reports: Reports) -> str:
-    """Five seeds in one program on one GPU, beside one."""
+    """Five seeds in one program on one GPU, next to one."""
     rows = matching(reports["loop_h200"]["rows"], method="mappo_l")
     body = []
     for one in matching(rows, seeds=1):
@@ -466,7 +466,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
     "hub": hub,
-    "beside": beside,
+    "alternatives": alternatives,
     "limits": limits,
     "side_by_side": side_by_side,
     "peers": Table(

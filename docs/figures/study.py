@@ -23,7 +23,7 @@ from . import style
 DOCS = pathlib.Path(__file__).parents[1]
 PANELS = {"end": "true cost of an episode", "reward": "reward of an episode"}
 SHOWN = ("mappo_l", "f4sg", "r4sg", "mixed", "macpo")
-# Where a method's name stands beside its last mark in either panel: points to the right and up, and its alignment.
+# Where a method's name stands next to its last mark in either panel: points to the right and up, and its alignment.
 PLACES = {
     "end": {"r4sg": (-4, 10, "right"), "mixed": (-6, -11, "right"), "macpo": (-9, 0, "right")},
     "reward": {"r4sg": (-8, -12, "right"), "mixed": (-9, 0, "right"), "macpo": (-9, 6, "right")},

@@ -1,4 +1,4 @@
-"""What all figures of the documents share: names and colours of methods, and labels that stand beside their lines."""
+"""What all figures of the documents share: names and colours of methods, and labels that stand next to their lines."""
 
 from __future__ import annotations
 

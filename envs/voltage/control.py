@@ -357,7 +357,7 @@ class VoltageControl:
     # Physics
 
     def q_limit(self, row: jax.Array) -> jax.Array:
-        """[n_pv] MVAr that the inverters' ratings leave beside the active power."""
+        """[n_pv] MVAr that the inverters' ratings leave next to the active power."""
         pv = row[: self.num_agents]
         return jnp.sqrt(jnp.maximum(self.s_max**2 - pv**2, 0))
 

@@ -66,7 +66,7 @@ class Hyper:
     std_half_life: float = learning(
         math.inf,
         "environment steps of a seed in which the noise of actions, their standard deviation, halves after "
-        "std_decay_start, beside what the policies learn of it; inf leaves it to them",
+        "std_decay_start, on top of what the policies learn of it; inf leaves it to them",
         STEPS_OR_INF,
     )
     std_decay_start: float = learning(

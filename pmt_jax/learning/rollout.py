@@ -155,7 +155,7 @@ def summary(batch: Batch, shares_cost: bool = False) -> dict[str, jax.Array]:
     """Metrics of a batch, scalars; episode metrics are means over the episodes that ended (nan if none did).
 
     episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
-    summed over K), and beside it each agent's and cost's, see `limits.columns`. violation_rate: share of steps with a
+    summed over K), and next to it each agent's and cost's, see `limits.columns`. violation_rate: share of steps with a
     cost above 0 for some agent. step_reward, step_cost: means per step. Costs are as observed; true_episode_cost,
     true_violation_rate and true_step_cost are the same of the true costs (see `envs.vector.observed_cost`).
 

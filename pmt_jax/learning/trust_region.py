@@ -157,7 +157,7 @@ def conjugate_gradient(hvp: Hvp, b: jax.Array, iterations: int = 10, tolerance: 
 def solve(hvp: Hvp, b: jax.Array, uncoupled: jax.Array | None = None) -> jax.Array:
     """x [P] with H x = b: exact where `uncoupled`, by conjugate gradient elsewhere.
 
-    Ten iterations do not reach the standard deviations of a Gaussian: their curvature is small beside that of the
+    Ten iterations do not reach the standard deviations of a Gaussian: their curvature is small next to that of the
     network that makes its mean, and a step four times too short along them was seen.
 
     Args:

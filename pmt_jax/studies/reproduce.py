@@ -1,4 +1,4 @@
-"""`pmt reproduce`: the paper's tables, trained and printed beside the paper's numbers."""
+"""`pmt reproduce`: the paper's tables, trained and printed next to the paper's numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .sweep import ONE_AT_A_TIME, Launch, check_tasks, missing_programs, train_p
 
 
 def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
+    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it next to the paper's.
 
     Args:
       name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.

@@ -1,4 +1,4 @@
-"""`pmt table`: method x (reward, cost, violation rate), with intervals over seeds, beside the paper's numbers."""
+"""`pmt table`: method x (reward, cost, violation rate), with intervals over seeds, next to the paper's numbers."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from .history import checkpoint_steps
 
 KEEP = 2
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
-_PROVENANCE = "provenance"  # its name in the npz, beside the paths of arrays
+_PROVENANCE = "provenance"  # its name in the npz, next to the paths of arrays
 _ROW = "['row']"  # before the names of what is known of a row that has not ended
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 

@@ -42,7 +42,7 @@ class Programs(NamedTuple):
       where_seed: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
       evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       measures: the names of these metrics.
-      close: ends what runs beside this process for them.
+      close: ends what runs next to this process for them.
     """
 
     chunk: Callable[[LearnerState, int], tuple[LearnerState, Metrics]]
@@ -190,7 +190,7 @@ def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
 
 @contextlib.contextmanager
 def compiling(kernels: Sequence[Callable[[], Any]], say: Say) -> Iterator[None]:
-    """Compiles the physics' kernels on threads beside what is done inside, and waits for them at its end.
+    """Compiles the physics' kernels on threads while the block runs, and waits for them at its end.
 
     One that cannot be compiled raises when it is first launched.
     """

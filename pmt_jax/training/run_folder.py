@@ -45,7 +45,7 @@ class Rescue:
     """Where a run is saved whose folder is gone.
 
     Attributes:
-      of: the run folder or the sweep's; the place is beside it, `OF-rescued`.
+      of: the run folder or the sweep's; the place is next to it, `OF-rescued`.
       files: {path below that: text} of what it needs besides the run's own files.
     """
 
@@ -276,7 +276,7 @@ class RunFolder:
         self.checkpoints.save(step, tree, self._provenance)
 
     def rescue(self, step: int, tree: Any) -> pathlib.Path:
-        """Saves the run in a new folder beside the one that is gone, whole but for older checkpoints.
+        """Saves the run in a new folder next to the one that is gone, whole but for older checkpoints.
 
         Returns:
           its path.

@@ -75,7 +75,7 @@ def train(
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
-      rescue: where the run is saved if its folder is gone; beside it if None.
+      rescue: where the run is saved if its folder is gone; next to it if None.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
@@ -452,13 +452,15 @@ class Trainer:
             self.say(f"seed(s) {seeds} broke; the last finite state and the best of every seed are saved in {where}")
 
     def rescue(self, gone: lock.Gone) -> str:
-        """Saves a run beside its folder that is gone; returns what happened and how to continue."""
+        """Saves a run next to its folder that is gone; returns what happened and how to continue."""
         if not self._is_open:
             return f"stopped: {gone}; nothing new was trained yet"
         try:
             saved = self.folder.rescue(self.step, self._tree)
         except OSError as error:
-            return f"stopped: {gone}; what was trained is lost, as no folder beside it can be written: {error.strerror}"
+            return (
+                f"stopped: {gone}; what was trained is lost, as no folder next to it can be written: {error.strerror}"
+            )
         return f"stopped: {gone}; saved as of step {self.step:,} in {saved}. Continue with: {self._continuing(saved)}"
 
     def write_failure(self, error: OSError) -> str:

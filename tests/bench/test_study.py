@@ -97,14 +97,14 @@ def test_cells_of_a_comparison_are_read_at_the_same_update():
     early = stored("mappo_l", 0.5, [4.0] * 8, num_envs=16, lr_half_life=2e5)
     late = stored("f4sg", 0.5, [6.0] * 8, num_envs=64, lr_half_life=2e5) | {"steps": list(range(40, 840, 80))}
     late["true_episode_cost"] = [[6.0] * 5 + [1.0] * 5] * 8  # what comes after the other's last update
-    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in rounds.beside([[early, late]]).splitlines()[2:]]
+    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in rounds.compared([[early, late]]).splitlines()[2:]]
     assert [(row[1], row[3]) for row in rows] == [("MAPPO-L", "4.0 +- 0.0"), ("F4SG", "6.0 +- 0.0")]
     assert [row[-2] for row in rows] == ["0 of 8", "8 of 8"]
     assert rows[0][-1] == "-" and rows[1][-1].startswith("< .001")
 
 
 def test_a_later_form_is_read_at_its_own_end_and_a_cell_without_its_like_alone(tmp_path: pathlib.Path):
-    """As the limits' study fixed before its runs: MACPO's runs of eight million steps beside those of ten."""
+    """As the limits' study fixed before its runs: MACPO's runs of eight million steps next to those of ten."""
     falls = [[8.0] * 5 + [2.0] * 5] * 8
     before = [stored("macpo", 1.0, [2.0] * 8, lambda_rule="integral") | {"true_episode_cost": falls, "cost_limit": 1.0}]
     (tmp_path / "limits_less_noise_h100.json").write_text(json.dumps(before))

@@ -48,7 +48,7 @@ STATED: dict[str, dict[str, str]] = {
         "seeds and a reward of limits_less_noise_h100.json": "19 3,139",
         "seeds of limits_pid_h200.json and limits_unclipped_h200.json": "14 12",
         "month": "11",
-        "reward of the control in limits_unclipped_h200.json, and p of rewards beside it": "4,960 .005",
+        "reward of the control in limits_unclipped_h200.json, and p of rewards next to it": "4,960 .005",
         "rounded rewards and a p of limits_4x2_h200.json": "3,000 2,000 .121",
         "rewards that the study asked for": "4,563 4,501",
         "steps of MACPO, millions, and a half-life": "5.6 6.6 0.3e6",

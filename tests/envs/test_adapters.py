@@ -18,7 +18,7 @@ from envs.toys import HORIZON, Lane
 
 
 class Fragile(Lane):
-    """`lane` that terminates beyond 0.3 and starts anywhere near 0, so that ends and new starts can be distinguished."""
+    """`lane` that terminates beyond 0.3 and starts anywhere near 0, so that new starts show."""
 
     def reset(self, key: jax.Array) -> State:
         return self.restore(jax.random.uniform(key, maxval=0.1), 0, jnp.zeros((2, 2)), key)

@@ -1,4 +1,4 @@
-"""Kernels of the physics compile beside XLA's program and before the first update; Warp's own lines stay away."""
+"""Kernels of the physics compile in parallel with XLA's program, before the first update; Warp's lines stay away."""
 
 from __future__ import annotations
 
