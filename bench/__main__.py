@@ -26,7 +26,7 @@ from pmt_jax.studies import plot
 
 from . import compare, records, render, runner
 from .cases import BENCHES
-from .forms import runs
+from .tables import runs
 
 say = functools.partial(print, flush=True)
 

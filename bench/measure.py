@@ -1,7 +1,7 @@
 """Cases become programs, programs take turns, turns become rows.
 
 A row says what its case is about, the median rate of its turns and the `rates` of all of them in order, so that ratios
-can be taken turn by turn (`bench/forms/tables.py`). Each turn waits a while for other work on the machine to pause and
+can be taken turn by turn (`bench/tables/speed.py`). Each turn waits a while for other work on the machine to pause and
 notes how much of it went on.
 """
 

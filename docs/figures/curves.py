@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
-from bench.forms import runs
+from bench.tables import runs
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group
 

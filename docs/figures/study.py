@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
-from bench.forms import runs, study
+from bench.tables import runs, study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 from pmt_jax.studies.statistics import mean_interval
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import EngFormatter
 
-from bench.forms import study
+from bench.tables import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
 NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}

@@ -17,17 +17,21 @@ from .run_log import read_all
 from .sweep import ONE_AT_A_TIME, Launch, check_tasks, missing_programs, train_programs
 
 
-def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
+def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it next to the paper's.
 
     Args:
-      name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
+      name: a table in paper.toml; budget: one of its budgets; layout: of the table, see `table.FORMATS`.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
     """
     paper = table.paper()
-    choices = (("table", name, paper["tables"]), ("budget", budget, paper["budgets"]), ("format", form, table.FORMATS))
+    choices = (
+        ("table", name, paper["tables"]),
+        ("budget", budget, paper["budgets"]),
+        ("format", layout, table.FORMATS),
+    )
     for what, word, known in choices:
         if word not in known:
             raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
@@ -47,7 +51,7 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
         return code
     logs = read_all([out / task / point for task, points in plans.items() for point in points])
     launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
-    launch.say(table.render(rows(logs), form, wanted["baseline"]))
+    launch.say(table.render(rows(logs), layout, wanted["baseline"]))
     return 0
 
 

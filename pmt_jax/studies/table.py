@@ -22,31 +22,31 @@ from .rows import Column, TableRow, compared, shown
 FORMATS = (*formats.WRITERS, "json")
 
 
-def render(table: Sequence[TableRow], form: str = "text", baseline: str | None = None, test: bool = False) -> str:
+def render(table: Sequence[TableRow], layout: str = "text", baseline: str | None = None, test: bool = False) -> str:
     """The table with what its numbers mean.
 
     Args:
-      form: text, markdown, latex or json.
+      layout: text, markdown, latex or json.
       baseline: a row's label, or a method with no more than one row per task, that the others are held against.
       test: also print p values.
 
     Raises:
       UsageError: an unknown format or baseline, or a test without a baseline.
     """
-    if form not in FORMATS:
-        raise UsageError(f"unknown format '{form}'{did_you_mean(form, FORMATS)}")
+    if layout not in FORMATS:
+        raise UsageError(f"unknown format '{layout}'{did_you_mean(layout, FORMATS)}")
     if test and not baseline:
         raise UsageError("--test compares with a baseline: name a row with --baseline, like --baseline mappo_l")
     data = summarise(table, baseline)
     together = effects.overall(table, baseline) if baseline else {}
     notes = _notes(table, data, baseline, test)
-    if form == "json":
+    if layout == "json":
         everything = {"rows": data, "baseline": baseline, "all_tasks": together, "notes": notes}
         return json.dumps(everything, indent=1) + "\n"
     for label, better in together.items():
         listed = ", ".join(f"P({name}) {_interval(found, 'probability')}" for name, found in better.items())
         notes.append(f"All tasks together, {label}: {listed}.")
-    return formats.write(*_cells(table, data, baseline, test), form, notes)
+    return formats.write(*_cells(table, data, baseline, test), layout, notes)
 
 
 def cells(table: Sequence[TableRow]) -> tuple[list[str], list[list[str]], list[str]]:

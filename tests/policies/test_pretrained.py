@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bench.forms import tables
+from bench.tables import speed
 from paths import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
@@ -144,7 +144,7 @@ def test_a_policy_of_the_package(name: str):
 def test_what_is_told_about_them_and_how_large_they_are():
     found = publish.rows()
     assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == found
-    assert tables.hub({"hub": {"rows": found}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
+    assert speed.hub({"hub": {"rows": found}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
     assert sum(row["bytes"] for row in found) < 4e6
 
 

@@ -137,12 +137,12 @@ def _ours(row: Record, rows: Records) -> list[float]:
 # Columns
 
 
-def _shown(form: str, found: Figure | str) -> Callable[[Record, Records], str]:
+def _shown(pattern: str, found: Figure | str) -> Callable[[Record, Records], str]:
     """A column: a figure (or what stands in the row under that name) in some format, `-` if there is none."""
 
     def cell(row: Record, rows: Records) -> str:
         value = row.get(found) if isinstance(found, str) else found(row, rows)
-        return form.format(value) if value is not None else "-"
+        return pattern.format(value) if value is not None else "-"
 
     return cell
 

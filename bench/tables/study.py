@@ -1,6 +1,6 @@
 """The tables of docs/results/study.md: stored runs of seldom observed costs, read as the preregistration says.
 
-Those of the later rounds are in rounds.py.
+Those of the later studies are in later_studies.py.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def measures(run: runs.Run, until: float = np.inf) -> dict[str, Scores]:
     }
 
 
-def pooled(rounds: Sequence[dict[str, Scores]]) -> dict[str, Scores]:
-    """The measures of the seeds of several rounds together."""
-    return {name: np.concatenate([scores[name] for scores in rounds]) for name in rounds[0]}
+def pooled(studies: Sequence[dict[str, Scores]]) -> dict[str, Scores]:
+    """The measures of the seeds of several studies together."""
+    return {name: np.concatenate([scores[name] for scores in studies]) for name in studies[0]}
 
 
 def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
@@ -68,8 +68,8 @@ def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
     name = NAMES[run["method"]]
     mine = settings(run)
     differing = [
-        form.format(f"{mine[key]:g}" if isinstance(mine[key], float) else mine[key])
-        for key, form in SHOWN.items()
+        pattern.format(f"{mine[key]:g}" if isinstance(mine[key], float) else mine[key])
+        for key, pattern in SHOWN.items()
         if mine[key] != ""
         and any(repr(settings(x)[key]) != repr(mine[key]) for x in among if x["method"] == run["method"])
     ]
@@ -190,7 +190,7 @@ def as_equivalence(file: pathlib.Path) -> str:
 
 
 def as_equivalence_pooled(files: pathlib.Path) -> str:
-    """Question c on the grid under noise: all seeds of several rounds with the same settings; a + joins files."""
+    """Question c on the grid under noise: all seeds of several studies with the same settings; a + joins files."""
     found = [run for name in files.stem.split("+") for run in runs.load(files.with_stem(name))]
     usual = {"cost_seen": 0.05, "lambda_lr": 12.0, "lambda_init": 0.78, "lambda_kp": 0.0}
     usual |= {"lr_half_life": np.inf, "regret_response": "letter", "kappa": 0.5, "surrogate_weight": 1.0}
@@ -333,15 +333,15 @@ def as_noise(file: pathlib.Path) -> str:
 
 
 def mean_sd(x: Scores) -> str:
-    form = ".0f" if abs(x.mean()) >= 100 else ".1f"
-    return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
+    spec = ".0f" if abs(x.mean()) >= 100 else ".1f"
+    return f"{x.mean():{spec}} +- {x.std(ddof=1):{spec}}"
 
 
 def p_value(value: float) -> str:
     return "< .001" if value < 0.001 else f"{value:.3f}".lstrip("0") if value < 1 else "1"
 
 
-FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "study": as_study,
     "lag": as_lag,
     "equivalence": as_equivalence,

@@ -332,7 +332,7 @@ def as_method(file: pathlib.Path) -> str:
     return markdown(("task", "method", "reward", "cost", "limit", "seeds within"), body)
 
 
-FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "curves": as_pmt_table,
     "points": as_points,
     "mean_actions": as_mean_actions,
