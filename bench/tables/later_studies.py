@@ -17,6 +17,7 @@ from pmt_jax.config.settings import Config
 from pmt_jax.studies.statistics import holm, iqm, probability_of_improvement, u_test
 
 from . import runs
+from .speed import markdown
 from .study import (
     NAMES,
     Scores,
@@ -32,7 +33,6 @@ from .study import (
     unsafe,
     welch,
 )
-from .tables import markdown
 
 Read = Callable[[Sequence[runs.Run]], list[dict[str, Scores]]]
 

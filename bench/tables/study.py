@@ -19,7 +19,7 @@ from pmt_jax.studies.statistics import difference_interval, holm, iqm, iqm_inter
 
 from .. import records
 from . import runs
-from .tables import markdown, matching
+from .speed import markdown, matching
 
 Scores = NDArray[np.float64]  # [seeds]
 
