@@ -63,15 +63,6 @@ COLUMNS = (
         note="cost beyond: an episode's cost beyond the limit, 0 within it, mean over all of training",
         throughout=True,
     ),
-    # Of runs before 2026-11-27. It depends on `cost_estimate`, and the rate counts what is left of an ended episode.
-    Column(
-        "estimate beyond",
-        "cost_beyond",
-        0,
-        note="estimate beyond: of the cost per episode that the multiplier is updated with, what is beyond the limit, "
-        "mean over all of training",
-        throughout=True,
-    ),
 )
 
 

@@ -51,30 +51,10 @@ ONE_AT_A_TIME = Launch()
 
 
 def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of the `points` of `parts` (see `train_points`) and says which meet the limit best.
+    """Trains what is missing of the `points` of `parts` and says which meet the limit best.
 
-    draws.json holds what was drawn at random.
-    """
-    with lock.acquire(out):
-        wanted = missing_programs(points, out, launch.say)
-        if values := drawn(parts, points):
-            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
-            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
-            with writing(out / "draws.json") as partial:
-                partial.write_text(json.dumps(values, indent=1) + "\n")
-        _check_missing(wanted)
-        code = train_programs(wanted, launch)
-    if code == 0:
-        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        found = rows(read_all([out / name for name in points]), launch.say)
-        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
-    return code
-
-
-def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of `points`, each into its own folder under `out`.
-
-    Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
+    Each point has its own folder in `out`, and draws.json holds what was drawn at random. Finished points are skipped;
+    points that were interrupted continue from their last checkpoint, bit for bit.
 
     Returns:
       The exit code of `trainer.train`: 0 when all points are finished.
@@ -83,15 +63,21 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
       UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
     """
     with lock.acquire(out):
-        programs = missing_programs(points, out, launch.say)
-        _check_missing(programs)
-        return train_programs(programs, launch)
-
-
-def _check_missing(programs: Sequence[Program]) -> None:
-    configs = [config for program in programs for config in program.points.values()]
-    if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
-        check_tasks(configs)
+        wanted = missing_programs(points, out, launch.say)
+        if values := drawn(parts, points):
+            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
+            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
+            with writing(out / "draws.json") as partial:
+                partial.write_text(json.dumps(values, indent=1) + "\n")
+        configs = [config for program in wanted for config in program.points.values()]
+        if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
+            check_tasks(configs)
+        code = train_programs(wanted, launch)
+    if code == 0:
+        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+        found = rows(read_all([out / name for name in points]), launch.say)
+        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
+    return code
 
 
 def check_tasks(configs: Iterable[Config]) -> None:
