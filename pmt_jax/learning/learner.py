@@ -17,7 +17,7 @@ from .debug import check_finite, watched
 from .maths import running_moments
 from .maths.advantages import gae
 from .optimise import init_train_state
-from .policies import policy_samples, update_policies
+from .policies import Team, policy_samples, update_policies
 from .setup import Setup, make_setup
 from .types import Batch, Critic, LearnerState, Metrics, Tag
 
@@ -143,11 +143,11 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     samples, cost_samples = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
-    held = dataclasses.replace(held, estimate=estimate)
+    team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
     fitted = sharding.in_parallel(
         partial(fit_critic, state.critic, setup.nets.value, hyper.clip, samples, tagged[Tag.CRITIC]),
         partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_samples, tagged[Tag.COST_CRITIC]),
-        partial(update_policies, setup, hyper, now, state.actor, held, actor_samples, excess, tagged),
+        partial(update_policies, setup, hyper, now, team, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, held, actor_metrics) = fitted
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,26 +20,25 @@ from .trust_region import trust_region_steps
 from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Tag, TrainState
 
 
+class Team(NamedTuple):
+    """What an update of policies takes: actors, constraints [N, K], samples [N, R, ...], excess [N, K] a step."""
+
+    actor: TrainState
+    constraint: Constraint
+    samples: PolicySamples
+    excess: jax.Array
+
+
 def update_policies(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    samples: PolicySamples,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
     """Updates every agent's policy and its constraint; then the noise of actions falls (`std_half_life`).
-
-    Args:
-      samples: leaves [N, R, ...]; excess: [N, K] in cost per step.
 
     Returns:
       actors, constraints [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
     """
     update = {"sequential": _sequential, "simultaneous": _simultaneous}[setup.method.order]
-    actor, constraint, metrics = update(setup, hyper, now, actor, constraint, samples, excess, tagged)
+    actor, constraint, metrics = update(setup, hyper, now, team, tagged)
     kl = metrics.pop("kl_per_agent")
     actor = dataclasses.replace(actor, params=setup.nets.scale_std(actor.params, now.std_factor))
     return actor, constraint, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
@@ -82,14 +81,7 @@ def policy_samples(
 
 
 def _sequential(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    samples: PolicySamples,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
     """Updates agents in random order, each corrected by the ratios of those before it (HAPPO)."""
 
@@ -97,35 +89,27 @@ def _sequential(
         carry: tuple[TrainState, Constraint, jax.Array], i: jax.Array
     ) -> tuple[tuple[TrainState, Constraint, jax.Array], Metrics]:
         actor, constraint, factor = carry
-        mine = dataclasses.replace(select_agent(samples, i), factor=factor)
-        own, key = select_agent(constraint, i), jax.random.fold_in(tagged[Tag.ACTOR], i)
-        net, reach, metrics = update_policy(
-            setup, hyper, now, select_agent(actor, i), mine, excess[i] + own.lowered, key
-        )
+        net, own, mine, excess = select_agent(team._replace(actor=actor, constraint=constraint), i)
+        mine, key = dataclasses.replace(mine, factor=factor), jax.random.fold_in(tagged[Tag.ACTOR], i)
+        net, reach, metrics = update_policy(setup, hyper, now, net, mine, excess + own.lowered, key)
         log_ratio, metrics["kl_per_agent"] = policy_change(setup, net.params, mine)
-        own = respond(setup, hyper, now, own, mine, excess[i], log_ratio, reach)
+        own = respond(setup, hyper, now, own, mine, excess, log_ratio, reach)
         actor, constraint = jax.tree.map(lambda all_, one: all_.at[i].set(one), (actor, constraint), (net, own))
         # The factor corrects the distribution of the executed joint action: no regret weight in it.
         return (actor, constraint, factor * jnp.exp(log_ratio)), metrics
 
     order = jax.random.permutation(tagged[Tag.ORDER], setup.nets.num_agents)
-    start = (actor, constraint, jnp.ones_like(samples.factor[0]))
+    start = (team.actor, team.constraint, jnp.ones_like(team.samples.factor[0]))
     (actor, constraint, _), metrics = jax.lax.scan(one_agent, start, order)
     metrics["kl_per_agent"] = metrics["kl_per_agent"][jnp.argsort(order)]
     return actor, constraint, metrics
 
 
 def _simultaneous(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    samples: PolicySamples,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
     """Updates all agents from the same policies; a shared actor is fitted to the samples of all agents."""
+    actor, constraint, samples, excess = team
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
     per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), samples)

@@ -188,9 +188,8 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
         setup, hyper, state.constraint.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
     excess = jnp.asarray([[0.5], [0.25]])
-    actor, constraint, _ = policies.update_policies(
-        setup, hyper, now, state.actor, state.constraint, rows, excess, tagged
-    )
+    team = policies.Team(state.actor, state.constraint, rows, excess)
+    actor, constraint, _ = policies.update_policies(setup, hyper, now, team, tagged)
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)
