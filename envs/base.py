@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import numbers
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -191,6 +191,7 @@ class Declarations:
       picture: how an episode is drawn.
       baselines: name -> a function that makes a policy which needs no training.
       overflow: the name in `info` that is above 0 if the physics lost contacts, which makes a step wrong.
+      kernels: what the physics needs compiled besides XLA's programs, as calls for any threads; only warp needs some.
     """
 
     observation: Blocks = ()
@@ -199,6 +200,7 @@ class Declarations:
     picture: Plain | Scene | NetworkMap = Plain()
     baselines: Mapping[str, Callable[[], Controller]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None
+    kernels: Callable[[], Sequence[Callable[[], Any]]] = tuple
 
 
 def shares_cost(env: Env) -> bool:

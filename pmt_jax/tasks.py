@@ -37,7 +37,6 @@ __all__ = [
     "installed_version",
     "observed_cost",
     "is_file",
-    "kernels",
     "make",
     "names",
     "options",
@@ -106,13 +105,6 @@ def baseline(env: Env, name: str) -> Controller:
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
     return known[name]()
-
-
-def kernels(env: Env) -> list[Callable[[], Any]]:
-    """What `env` needs compiled besides XLA's programs, which only Warp's physics does; calls for any threads."""
-    if env.engine != "warp":
-        return []
-    return importlib.import_module(f"{_envs().__name__}.physics.warp_kernels").needed()
 
 
 def columns(name: str) -> Mapping[str, Column]:

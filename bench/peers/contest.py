@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from .. import records, runner
 from ..records import Record
 from . import learners
+from .report import Report
 
 Lines = list[dict[str, Any]]
 SIZES = ("num_envs", "rollout_length", "epochs", "minibatches")
@@ -35,7 +36,7 @@ class Peer(NamedTuple):
     name: str
     task: str
     networks: str
-    learn: Callable[[learners.Arguments, learners.Report], None]
+    learn: Callable[[learners.Arguments, Report], None]
     method: str = "mappo_l"
 
 

@@ -144,6 +144,7 @@ class AntCorridor:
             actions=tuple(tuple(names[motor] for motor in group) for group in self._partition.groups),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
+            kernels=getattr(self._engine, "kernels", tuple),
         )
         self.spec = EnvSpec(
             name=f"ant_{self._partition.name}",

@@ -42,7 +42,6 @@ class WarpEngine:
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
         self._call: Any = None
         self._stepping = threading.Lock()  # devices may call at once, and the CPU's share their data
-        warp_kernels.engines.add(self)
 
     def start(self) -> PhysicsState:
         return rest_state(self._c_model)
@@ -120,8 +119,12 @@ class WarpEngine:
             for name, array in zip(self._fields(), outputs, strict=True):
                 warp.copy(array, getattr(data, name))
 
-    def rehearse(self) -> None:
-        """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
+    def kernels(self) -> list[Callable[[], Any]]:
+        """What `step` launches; each entry compiles a part and loads it, on any thread."""
+        return warp_kernels.of_launches(self._step_one)
+
+    def _step_one(self) -> None:
+        """Launches what `step` does, for one world and without XLA; no batch changes the kernels."""
         from mujoco.mjx.third_party import mujoco_warp
 
         model, data = self.worlds(1)

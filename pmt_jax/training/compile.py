@@ -179,10 +179,10 @@ def _options(once: bool = False) -> dict[str, str | bool] | None:
     return None if option in os.environ.get("XLA_FLAGS", "") else {option: level}
 
 
-def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
+def _kernels(setup: Setup, say: Say) -> Sequence[Callable[[], Any]]:
     """What the physics needs besides XLA's programs."""
     try:
-        return tasks.kernels(setup.vector.env)
+        return tasks.declarations(setup.vector.env).kernels()
     except Exception as error:  # found through private places of Warp; without them it compiles as it goes
         say(f"the first update compiles the physics' kernels: {error}")
         return []

@@ -12,7 +12,8 @@ from bench import records
 from bench.__main__ import main
 from bench.peers import contest
 from bench.peers.contest import PEERS, Peer, figures, row
-from bench.peers.learners import Arguments, Report, ippo_mabrax
+from bench.peers.learners import Arguments, ippo_mabrax
+from bench.peers.report import Report
 from bench.tables import speed
 from pmt_jax import load_config
 from pmt_jax.errors import UsageError
