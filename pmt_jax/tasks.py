@@ -168,8 +168,6 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
     """
     envs = _envs()
     try:
-        if physics != "auto" and "physics" not in envs.task_options(name):
-            raise UsageError(f"task '{name}' is plain JAX and has no physics engine to choose; leave physics = auto")
         if physics != "auto":
             options["physics"] = physics
         return envs.make(name, **options)

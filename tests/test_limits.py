@@ -113,9 +113,9 @@ def test_the_best_state_is_chosen_by_every_agent_and_cost(data: st.DataObject, l
     cost = data.draw(costs(6, agents, len(limits.each)))
     reward = data.draw(st.permutations(range(6)))
     best = types.SimpleNamespace(state=np.array([-1]), reward=np.array([-np.inf]), cost=np.array([np.inf]))
-    take = lambda improved, old, new: np.where(improved, new, old)  # noqa: E731
+    where_seed = lambda improved, old, new: np.where(improved, new, old)  # noqa: E731
     trainer: Any = types.SimpleNamespace(
-        best=best, config=types.SimpleNamespace(eval_interval=0), programs=types.SimpleNamespace(take=take)
+        best=best, config=types.SimpleNamespace(eval_interval=0), programs=types.SimpleNamespace(where_seed=where_seed)
     )
     for at in range(6):
         trainer.state = np.array([at])

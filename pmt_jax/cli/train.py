@@ -68,38 +68,34 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
     with trusting(arguments.trust):
-        return _train(arguments)
+        config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
+        if arguments.resume and arguments.out is None:
+            raise UsageError("--resume needs --out, the folder of the run to continue")
+        if arguments.change and not arguments.resume:
+            raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
+        check_source(arguments.source, [config.task])
+        if arguments.verbose:
+            logging.getLogger("envs").setLevel(logging.INFO)
+        if sys.stdout.isatty():
+            say("loading JAX and the task ...")  # ten seconds with Warp
+        check_system()
+        numerics.check_settings()
+        from ..policies import warm_start
+        from ..training import processes, trainer
 
-
-def _train(arguments: argparse.Namespace) -> int:
-    config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
-    if arguments.resume and arguments.out is None:
-        raise UsageError("--resume needs --out, the folder of the run to continue")
-    if arguments.change and not arguments.resume:
-        raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
-    check_source(arguments.source, [config.task])
-    if arguments.verbose:
-        logging.getLogger("envs").setLevel(logging.INFO)
-    if sys.stdout.isatty():
-        say("loading JAX and the task ...")  # ten seconds with Warp
-    check_system()
-    numerics.check_settings()
-    from ..policies import warm_start
-    from ..training import processes, trainer
-
-    processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
-    numerics.check_devices()
-    return trainer.train(
-        config,
-        arguments.out,
-        arguments.resume,
-        cache=not arguments.no_cache,
-        loggers=arguments.loggers,
-        profile=arguments.profile,
-        say=say,
-        devices=arguments.devices,
-        workers=arguments.workers,
-        warm_start=warm_start.prepare,
-        debug=arguments.debug,
-        change=arguments.change,
-    )
+        processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
+        numerics.check_devices()
+        return trainer.train(
+            config,
+            arguments.out,
+            arguments.resume,
+            cache=not arguments.no_cache,
+            loggers=arguments.loggers,
+            profile=arguments.profile,
+            say=say,
+            devices=arguments.devices,
+            workers=arguments.workers,
+            warm_start=warm_start.prepare,
+            debug=arguments.debug,
+            change=arguments.change,
+        )

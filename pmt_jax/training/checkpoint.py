@@ -17,7 +17,7 @@ import os
 import pathlib
 import tomllib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -131,15 +131,15 @@ class Provenance:
         traced = {"seed": setup.trials.seed, **vars(setup.trials.hyper)}
         return cls(setup.config, {name: np.asarray(x).tolist() for name, x in traced.items()})
 
-    def dumps(self, step: int) -> np.ndarray:
+    def to_bytes(self, step: int) -> np.ndarray:
         """[bytes] uint8, JSON: what is said of the checkpoint after `step`."""
         seeds = self.trials.get("seed") or [self.config.seed + i for i in range(self.config.seeds)]
         said = {"step": step, "seeds": seeds, "settings": to_toml(self.config), "trials": self.trials}
         return np.frombuffer(json.dumps(said).encode(), np.uint8)
 
     @classmethod
-    def loads(cls, data: np.ndarray) -> tuple[int, Provenance]:
-        """The inverse of `dumps`.
+    def from_bytes(cls, data: np.ndarray) -> tuple[int, Provenance]:
+        """The inverse of `to_bytes`.
 
         Raises:
           UsageError: it has settings that this version of pmt-jax does not know.
@@ -177,6 +177,14 @@ class Saved(NamedTuple):
     row: dict[str, np.ndarray]
     provenance: Provenance | None
     damaged: list[int]
+
+    def unexplained(self, config: Config, changes: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+        """{setting: 'its value here -> its value in `config`'} of what the run's later `changes` do not explain."""
+        if self.provenance is None:
+            return {}
+        found = self.provenance.differences(Provenance(config))
+        made = {name: x for row in changes if row["step"] >= self.step for name, x in row["changed"].items()}
+        return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
 
 
 def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: bool = False) -> Saved:
@@ -218,7 +226,7 @@ def _provenance(
         warn(f"the checkpoint after {step:,} steps in {place} does not say which run it belongs to")
         return None
     try:
-        written, provenance = Provenance.loads(data)
+        written, provenance = Provenance.from_bytes(data)
     except UsageError as error:
         raise UsageError(f"the checkpoint after {step:,} steps in {place}: {error}") from None
     if written != step:
@@ -276,7 +284,7 @@ class Checkpoints:
         """
         if step in self.steps():
             return
-        self._write(step, pack(tree) | {_PROVENANCE: provenance.dumps(step)})
+        self._write(step, pack(tree) | {_PROVENANCE: provenance.to_bytes(step)})
 
     @processes.in_first
     def _write(self, step: int, table: dict[str, np.ndarray]) -> None:

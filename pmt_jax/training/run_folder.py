@@ -20,7 +20,6 @@ import numpy as np
 
 from .. import numerics
 from ..config.load import load_config, to_toml
-from ..config.settings import Config
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import learner
@@ -118,8 +117,8 @@ class RunFolder:
                     f"{self.path} already holds {what}; choose another --out, or --resume to continue the run"
                 )
             return None
-        self._changes = read_changes(self.path)
         saved = newest(self.path, self._say, to_continue=True) if checkpoint_steps(self.path) else None
+        self._changes = read_changes(self.path)
         self._same_settings(saved, change)
         self._same_machine()
         return saved
@@ -129,7 +128,7 @@ class RunFolder:
         file = self.path / "config.toml"
         self._run, edited = Provenance(load_config(file)), {}
         if saved and saved.provenance:
-            edited = unexplained(saved, self._run.config, self._changes)
+            edited = saved.unexplained(self._run.config, self._changes)
             config = saved.provenance.config if edited else self._run.config
             self._run = Provenance(config, saved.provenance.trials)
         changed = self._run.differences(self._provenance)
@@ -444,7 +443,7 @@ def load_saved(
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     saved = _newest(folder, warn)
-    if edited := unexplained(saved, config, read_changes(folder)):
+    if edited := saved.unexplained(config, read_changes(folder)):
         raise UsageError(
             f"{folder / 'config.toml'} does not say what the checkpoint after {saved.step:,} steps was trained with; "
             f"mend that file, or move the checkpoint elsewhere if it is of another run:{listed(edited)}"
@@ -455,15 +454,6 @@ def load_saved(
 
 
 _newest = processes.in_first(newest)
-
-
-def unexplained(saved: Saved, config: Config, changes: Sequence[Row]) -> dict[str, str]:
-    """{setting: 'its value in the checkpoint -> its value in `config`'} of what `changes` after it do not explain."""
-    if saved.provenance is None:
-        return {}
-    found = saved.provenance.differences(Provenance(config))
-    made = {name: x for row in changes if row["step"] >= saved.step for name, x in row["changed"].items()}
-    return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
 
 
 def listed(changed: Mapping[str, str]) -> str:

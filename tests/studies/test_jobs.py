@@ -79,14 +79,14 @@ def test_after_a_failure_no_other_is_started_and_those_that_run_go_on():
 
 WAITING = """
 import pathlib, signal, sys, threading, time
-from pmt_jax.cli import worker
+from pmt_jax.cli import job
 file = pathlib.Path(sys.argv[1])
 def end(number, _):
     file.write_text(str(number))
     sys.exit(128 + number)
 signal.signal(signal.SIGINT, end)
 signal.signal(signal.SIGTERM, end)
-threading.Thread(target=worker._end_with_parent, daemon=True).start()
+threading.Thread(target=job._end_with_parent, daemon=True).start()
 file.write_text("ready")
 while True:
     time.sleep(0.05)

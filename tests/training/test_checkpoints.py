@@ -206,7 +206,7 @@ def test_the_trials_of_a_sweep_belong_to_its_checkpoint():
     trials = [Trials(hyper, jnp.array(seeds)) for seeds in ([0, 1], [0, 2])]
     ours, theirs = (checkpoint.Provenance.of(type(setup)(setup.config, *_rest(setup), trials=x)) for x in trials)
     assert ours.differences(theirs) == {"seed of the trials": "[0, 1] -> [0, 2]"} and not ours.differences(ours)
-    step, back = checkpoint.Provenance.loads(ours.dumps(400))
+    step, back = checkpoint.Provenance.from_bytes(ours.to_bytes(400))
     assert step == 400 and not back.differences(ours) and back.trials["seed"] == [0, 1]
     assert not ours.differences(checkpoint.Provenance(setup.config))
 
