@@ -38,7 +38,7 @@ def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: in
     partly = quick or bool(threads) or bool(only)
     benches, out = chosen(names), folder(out, partly)
     out.mkdir(parents=True, exist_ok=True)
-    committed = _committed(say)
+    committed = last_results(say)
     count, device = devices() if any(BENCHES[name].on != "cpu" for name in benches) else (0, "cpu")
     done, failed, stopped = [], [], False
     for number, name in enumerate(benches, 1):
@@ -124,7 +124,8 @@ def _child(words: Sequence[str], on_cpu: bool, result: pathlib.Path, say: Say) -
     return True
 
 
-def _committed(say: Say) -> dict[str, records.Report]:
+def last_results(say: Say) -> dict[str, records.Report]:
+    """The results of the last commit; none without a repository."""
     try:
         return records.load("HEAD")
     except UsageError:

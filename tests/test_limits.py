@@ -120,7 +120,7 @@ def test_the_best_state_is_chosen_by_every_agent_and_cost(data: st.DataObject, l
     for at in range(6):
         trainer.state = np.array([at])
         line = written_row(cost[at], limits, broken=None, episode_reward=float(reward[at]))
-        Trainer._keep_best(trainer, [line])
+        Trainer.keep_best(trainer, [line])
     chosen = int(trainer.best.state[0])
     worst = [max(itertools.chain(*beyond(one, limits))) for one in cost]
     if 0 in worst:

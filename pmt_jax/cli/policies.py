@@ -86,13 +86,13 @@ def run_eval(arguments: argparse.Namespace) -> int:
     count = f"{episodes} episode{'s' * (episodes > 1)}"
     result(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
-        _say_row(row)
+        say_row(row)
     if arguments.save:
         result(f"wrote every step to {arguments.save}")
     return 0
 
 
-def _say_row(row: dict[str, Any]) -> None:
+def say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
     from ..limits import Limits
 

@@ -120,7 +120,7 @@ def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Progra
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
-    return [Program(folder, group, out) for folder, group in _groups(points, missing, out)]
+    return [Program(folder, group, out) for folder, group in grouped(points, missing, out)]
 
 
 def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) -> int:
@@ -166,7 +166,7 @@ def _finished(folder: pathlib.Path, config: Config) -> bool:
     return True
 
 
-def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
+def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
     """What trains together and where: groups begun earlier that are still wanted as they are, then new ones."""
     left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
@@ -214,11 +214,11 @@ def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) ->
     if not lock.is_held(folder):
         say(f"stopped: {folder} was deleted, renamed or replaced; its points get no folders in {out}")
         return 1
-    _cut(folder, group, out)
+    cut_points(folder, group, out)
     return 0
 
 
-def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
+def cut_points(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
     rows = program_folder.rows(folder, group)

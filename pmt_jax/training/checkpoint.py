@@ -37,7 +37,7 @@ from .history import checkpoint_steps
 KEEP = 2
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
 _PROVENANCE = "provenance"  # its name in the npz, next to the paths of arrays
-_ROW = "['row']"  # before the names of what is known of a row that has not ended
+ROW = "['row']"  # before the names of what is known of a row that has not ended
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
@@ -201,8 +201,8 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
     damaged, place, steps = [], folder / "checkpoints", checkpoint_steps(folder)
     for step in steps:
         try:
-            packed = _read(place / str(step))
-        except (_Damaged, OSError) as error:
+            packed = read_table(place / str(step))
+        except (Damaged, OSError) as error:
             said = f"the checkpoint after {step:,} steps in {place} cannot be read ({_reason(error)})"
             if to_continue and isinstance(error, OSError):
                 raise UsageError(
@@ -212,7 +212,7 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
             warn(said)
             damaged.append(step)
             continue
-        row = {path[len(_ROW) + 2 : -2]: packed.pop(path) for path in list(packed) if path.startswith(_ROW)}
+        row = {path[len(ROW) + 2 : -2]: packed.pop(path) for path in list(packed) if path.startswith(ROW)}
         return Saved(step, packed, row, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
     if steps:
         raise UsageError(f"no checkpoint in {place} can be read; restore one from a backup or train anew")
@@ -284,10 +284,15 @@ class Checkpoints:
         """
         if step in self.steps():
             return
-        self._write(step, pack(tree) | {_PROVENANCE: provenance.to_bytes(step)})
+        self.write_table(step, pack(tree) | {_PROVENANCE: provenance.to_bytes(step)})
 
     @processes.in_first
-    def _write(self, step: int, table: dict[str, np.ndarray]) -> None:
+    def write_table(self, step: int, table: dict[str, np.ndarray]) -> None:
+        """Writes {path: array} as the checkpoint after `step`.
+
+        Raises:
+          OSError: it cannot be written.
+        """
         data = _to_bytes(table)
         try:
             with _quiet():
@@ -324,16 +329,16 @@ class Checkpoints:
             self._manager.close()
 
 
-class _Damaged(Exception):
+class Damaged(Exception):
     """A checkpoint whose files can be read, but do not hold what was written."""
 
 
-def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
+def read_table(step: pathlib.Path) -> dict[str, np.ndarray]:
     """The table of one checkpoint.
 
     Raises:
       OSError: the disk does not give its files.
-      _Damaged: they are not whole.
+      Damaged: they are not whole.
     """
     try:
         for folder, _, names in os.walk(step, onerror=_raise):  # this fails with the system's reason, orbax does not
@@ -342,14 +347,14 @@ def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
         with _quiet(), ocp.StandardCheckpointer(multiprocessing_options=_alone()) as checkpointer:
             restored: Any = checkpointer.restore((step / "default").absolute())
         if "npz" not in restored:
-            raise _Damaged("it is of another version of pmt-jax")
+            raise Damaged("it is of another version of pmt-jax")
         return _from_bytes(np.asarray(restored["npz"]))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise _Damaged("it is incomplete") from error
-    except (OSError, MemoryError, _Damaged):
+        raise Damaged("it is incomplete") from error
+    except (OSError, MemoryError, Damaged):
         raise
     except Exception as error:  # whatever orbax and tensorstore make of damaged files
-        raise _Damaged(_reason(error)) from error
+        raise Damaged(_reason(error)) from error
 
 
 def _alone() -> ocp.options.MultiprocessingOptions:

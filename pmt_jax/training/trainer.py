@@ -257,8 +257,8 @@ class Trainer:
             self._before = self.state, self.step, self._row, self._row_start, dict(self.broken)
             try:
                 with failures.named(), self._others_may_save():
-                    rows = self._train_chunk()
-                    self._evaluate(rows)
+                    rows = self.train_chunk()
+                    self.evaluate(rows)
             except BaseException as error:
                 self._go_back()
                 self._save_before(error)
@@ -266,12 +266,12 @@ class Trainer:
             self.seconds = before + time.monotonic() - begin
             if rows:
                 self._log(rows)
-                self._keep_best(rows)
+                self.keep_best(rows)
             self.folder.check()
             if processes.agree(time.monotonic() - saved > CHECKPOINT_SECONDS):
-                self._save()
+                self.save()
                 saved = time.monotonic()
-        self._save()
+        self.save()
 
     @contextlib.contextmanager
     def _others_may_save(self) -> Iterator[None]:
@@ -294,7 +294,7 @@ class Trainer:
         self._go_back()
         try:
             with contextlib.suppress(jax.errors.JaxRuntimeError):
-                self._save()
+                self.save()
         except lock.Gone as gone:
             return self.rescue(gone)
         except OSError as error:
@@ -311,7 +311,7 @@ class Trainer:
         self._signal = processes.agree(interrupts.received[0] if interrupts.received else 0)
         return self._signal > 0
 
-    def _train_chunk(self) -> list[Row]:
+    def train_chunk(self) -> list[Row]:
         """Trains all seeds for some updates; the rows, if one ends with them.
 
         Seeds that break stay where they were when the row began.
@@ -353,7 +353,7 @@ class Trainer:
                 self.broken[i] = reason
         return rows
 
-    def _evaluate(self, rows: list[Row]) -> None:
+    def evaluate(self, rows: list[Row]) -> None:
         """Adds the columns of an evaluation, nan if none is due."""
         if self.programs.evaluate is None or not rows:
             return
@@ -376,7 +376,7 @@ class Trainer:
             assert self._speed is not None  # a chunk has ended
             self._progress.show(rows, self.config.seeds * self.config.batch_size / self._speed)
 
-    def _keep_best(self, rows: list[Row]) -> None:
+    def keep_best(self, rows: list[Row]) -> None:
         """Keeps each seed's state if it is the best so far, by the evaluation if there is one, else by training."""
         prefix = "eval/" if self.config.eval_interval else ""
         whole = [not row["broken"] for row in rows]
@@ -399,7 +399,8 @@ class Trainer:
         row = dict(self._row.metrics) | {"seconds": np.full(self.config.seeds, self.seconds)}
         return {"last": state, "best": self.best, "row": row}
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Writes a checkpoint after the step that training has reached."""
         self.folder.save(self.step, self._tree)
 
     def _save_before(self, error: BaseException) -> None:
@@ -407,7 +408,7 @@ class Trainer:
         if not isinstance(error, Exception) or jax.process_count() > 1:  # others would wait for this one for ever
             return
         with contextlib.suppress(jax.errors.JaxRuntimeError):
-            self._save()
+            self.save()
 
     @property
     def saved(self) -> str:

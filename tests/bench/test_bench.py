@@ -68,7 +68,7 @@ def test_one_that_fails_does_not_stop_the_others(
 ):
     out = fakes("first", "failing", "last")
     old = report() | {"machine": {}, "rows": [{"task": "lane", "steps_per_second": 200}]}
-    monkeypatch.setattr(runner, "_committed", lambda say: {"last": old})
+    monkeypatch.setattr(runner, "last_results", lambda say: {"last": old})
     assert main(["run", "--out", str(out)]) == 1
     assert sorted(path.name for path in out.iterdir()) == ["failing.json.unfinished", "first.json", "last.json"]
     said = capsys.readouterr().out

@@ -193,7 +193,7 @@ def test_a_checkpoint_that_does_not_say_what_it_belongs_to(copy: pathlib.Path, c
     saved = checkpoint.newest(copy, print)
     shutil.rmtree(copy / "checkpoints")
     checkpoints = checkpoint.Checkpoints(copy)
-    checkpoints._write(STEPS, saved.packed)
+    checkpoints.write_table(STEPS, saved.packed)
     checkpoints.close()
     for words in (("eval", copy, "--episodes", 1), (*RESUME, copy)):
         code, text, _ = cli(*words)

@@ -188,8 +188,8 @@ def test_what_follows_in_a_sweep_that_is_gone_is_not_trained(tmp_path: pathlib.P
 
     words = ("sweep", "lane", *ARGUMENTS[1:11], "--method", "mappo_l", "--steps", 200, "--no-cache")
     out = tmp_path / "sweep"
-    cut = sweep._cut
-    monkeypatch.setattr(sweep, "_cut", lambda *a: (cut(*a), emptied(out)))
+    cut = sweep.cut_points
+    monkeypatch.setattr(sweep, "cut_points", lambda *a: (cut(*a), emptied(out)))
     code, text, err = cli(*words, "--set", "activation=relu,tanh", "--out", out)
     assert code == 1 and not err and f"stopped: {out} was deleted, renamed or replaced" in text
     assert not list(out.iterdir())

@@ -80,7 +80,7 @@ def test_a_run_that_ends_at_once_gives_the_terminal_its_cursor_back(monkeypatch:
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setattr(os, "_exit", lambda code: terminal.write(f" exit {code}"))
     interrupts = signals.Interrupts(lambda text: terminal.write(text), lambda: None)
-    interrupts._answer(signal.SIGINT, at_once=True)
+    interrupts.answer(signal.SIGINT, at_once=True)
     assert terminal.getvalue() == "interrupted: nothing new was trained yet\x1b[?25h exit 130"
 
 
