@@ -68,7 +68,7 @@ def load(file: pathlib.Path) -> list[Run]:
     try:
         found = json.loads(file.read_text())
         for run in found:
-            _row(run)
+            row_of(run)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file} holds no stored runs ({type(error).__name__}: {error})") from None
     return found
@@ -131,12 +131,12 @@ def curves(run: Run) -> RunLog:
 
 def as_pmt_table(file: pathlib.Path) -> str:
     """The table that `pmt table` makes of the runs, without the sentences below it that say what its figures mean."""
-    return table.render(in_order([_row(run) for run in load(file)]), "markdown").split("\n\n")[0]
+    return table.render(in_order([row_of(run) for run in load(file)]), "markdown").split("\n\n")[0]
 
 
 def as_paper(file: pathlib.Path) -> str:
     """A line a run: mean ± standard deviation over seeds, as the paper has it, then the paper's own figures."""
-    shown = in_order([_row(run) for run in load(file)])
+    shown = in_order([row_of(run) for run in load(file)])
     found = table.summarise(shown)
     measured = [name for name in ("reward", "cost", "CR", "PL") if name in found[0]]
     published = [name for name in measured if any(name in row["paper"] for row in found)]
@@ -178,7 +178,8 @@ def as_overview(files: pathlib.Path) -> str:
 
 def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str]]:
     """{(task, label): a row, and its mean reward / cost and how many seeds keep the limit} of files that a + joins."""
-    found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
+    stored = [load(files.with_stem(name)) for name in files.stem.split("+")]
+    found = [row for each in stored for row in in_order([row_of(run) for run in each])]
     words = [
         f"{number(x['reward']['mean'], ',.4g')} / {number(x['cost']['mean'], '.3g')}, "
         f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
@@ -230,7 +231,7 @@ def as_ran(files: pathlib.Path) -> str:
     for name in files.stem.split("+"):
         found = load(files.with_stem(name))
         held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
-        kept = [beyond <= 0 for run in held for beyond in _row(run).beyond]
+        kept = [beyond <= 0 for run in held for beyond in row_of(run).beyond]
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
         line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
@@ -245,7 +246,7 @@ def as_pairs(file: pathlib.Path) -> str:
 
     A line below the table has the lowest p of each measure with Holm's correction over the pairs.
     """
-    found = in_order([_row(run) for run in load(file)])
+    found = in_order([row_of(run) for run in load(file)])
     p = {of: [[u_test(x.scores[of], y.scores[of]) for y in found] for x in found] for of in ("reward", "cost")}
     body = []
     for i, row in enumerate(found):
@@ -273,7 +274,7 @@ def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     return METHODS[method].constraint == "lagrangian" and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
 
 
-def _row(run: Run) -> TableRow:
+def row_of(run: Run) -> TableRow:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
     limits = Limits((run["cost_limit"],))
@@ -325,7 +326,7 @@ def as_method(file: pathlib.Path) -> str:
     for name in HEADLINES:
         found = {run["method"]: run for run in load(file.with_stem(name))}
         for method in dict.fromkeys((file.stem, "mappo_l")):
-            (row,) = table.summarise([_row(found[method])])
+            (row,) = table.summarise([row_of(found[method])])
             line = [f"`{row['task']}`", f"`{method}`"]
             line += [_mean_std(row[figure]["mean"], row[figure]["std"]) for figure in ("reward", "cost")]
             body.append([*line, f"{row['cost_limit']:g}", f"{round(row['within'] * row['seeds'])} of {row['seeds']}"])

@@ -22,7 +22,7 @@ import envs
 from bench import compare, measure, once, plain, records, render, runner, substep
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
-from bench.tables import pages, runs, speed
+from bench.tables import pages, runs, speed, values
 from docs.figures import ant_paths, curves, episode_cost, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError
@@ -290,6 +290,25 @@ def test_rendering_replaces_blocks_and_nothing_else():
     for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
         with pytest.raises(UsageError):
             render.render(broken, reports)
+
+
+def test_rendering_fills_numbers_in_sentences():
+    mark = "within:limits_macpo_recovery_h200:macpo:{}"
+    text = f"kept by <!-- bench: {mark.format('0.2:limit_windup=inf')} -->3<!-- /bench --> of 20"
+    assert "-->17<!-- /bench --> of 20" in render.render(text, {})
+    assert (
+        values.number(mark.format("*")) == "72" and values.number(mark.format("1").replace("within", "seeds")) == "20"
+    )
+    both = "within:velocity_ant_2x4_limit_5_h200+velocity_half_cheetah_2x3_limit_5_h200:r4sg+macpo:5"
+    assert values.number(both) == "17" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
+    for wrong, said in (
+        (mark.format("7"), "no run of limits_macpo_recovery_h200 is 'macpo:7'"),
+        ("withn:x:*:1", "unknown value 'withn'; did you mean 'within'?"),
+        ("within:x:*:1", "holds no stored runs"),
+        ("within:x", "expected within:FILE:METHOD:LIMIT"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(said)):
+            render.render(f"<!-- bench: {wrong} -->3<!-- /bench -->", {})
 
 
 def test_pages_describe_what_there_is():

@@ -288,9 +288,9 @@ def test_a_report_says_once_and_plainly_what_it_passes_over(copy: pathlib.Path, 
 def test_what_is_written_is_what_is_read():
     config = load_config("lane", "f4sg", cost_limit=2.5, seeds=3, seed=4)
     provenance = checkpoint.Provenance(config)
-    written = provenance.dumps(1234)
+    written = provenance.to_bytes(1234)
     assert json.loads(np.asarray(written).tobytes())["seeds"] == [4, 5, 6]
-    assert checkpoint.Provenance.loads(written) == (1234, provenance)
+    assert checkpoint.Provenance.from_bytes(written) == (1234, provenance)
     unknown = json.loads(written.tobytes()) | {"settings": 'task = "lane"\nnever = 1\n'}
     with pytest.raises(UsageError, match="unknown setting 'never'"):
-        checkpoint.Provenance.loads(np.frombuffer(json.dumps(unknown).encode(), np.uint8))
+        checkpoint.Provenance.from_bytes(np.frombuffer(json.dumps(unknown).encode(), np.uint8))
