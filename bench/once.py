@@ -23,8 +23,9 @@ from envs.voltage.certificate import certify
 from envs.voltage.control import VoltageControl
 from pmt_jax import load_config, make_setup, tasks
 from pmt_jax.learning.evaluation import EVALUATION_KEY
+from pmt_jax.learning.types import Best
 from pmt_jax.policies.evaluate import evaluate_baseline
-from pmt_jax.training import run_folder, trainer
+from pmt_jax.training import trainer
 from pmt_jax.training.checkpoint import Checkpoints, Provenance, newest, unpack
 from pmt_jax.training.compile import compile_run
 
@@ -89,15 +90,13 @@ def checkpoint(case: Case) -> Record:
     """
     setup = make_setup(load_config(case.task, method=case.method, num_envs=case.num_envs))
     state, programs = compile_run(setup, lambda _: None)
-    box = [state, run_folder.initial_best(state)]
+    box = [state, Best.initial(state)]
 
     def train() -> None:
         box[0], _ = programs.chunk(box[0], 1)
 
     def keep() -> None:
-        box[1] = run_folder.Best(
-            programs.where_seed(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost
-        )
+        box[1] = Best(programs.where_seed(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)
 
     chunk, copy = ([_seconds(work, box) for _ in range(CHUNKS)] for work in (train, keep))
     saved = {"last": box[0], "best": box[1]}

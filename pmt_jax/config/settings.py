@@ -337,6 +337,9 @@ def _validate(config: Config) -> None:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
     if config.lambda_unit == "relative" and not config.lambda_init:
         raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
+    for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
+        if option in dict(config.env):
+            raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
     if config.cost_estimate == "critic" and config.gamma == 1:
         raise UsageError(
             "cost_estimate = critic takes (1 - gamma) times the value for the cost of a step, which is 0; set gamma "

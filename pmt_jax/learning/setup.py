@@ -114,22 +114,13 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
         raise UsageError(found)
     method = METHODS[config.method]
     if env is None:
-        env = tasks.make(config.task, config.physics, **_options(config))
+        env = tasks.make(config.task, config.physics, **dict(config.env))
     else:
         tasks.check(env)
     _check_limits(config, env.spec)
     nets = networks.build(config, env.spec, method.share_actor)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
     return Setup(config, method, vector, nets)
-
-
-def _options(config: Config) -> dict[str, Any]:
-    """The task's options in `env`, which cannot be called as what `tasks.make` takes besides them."""
-    options = dict(config.env)
-    for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
-        if option in options:
-            raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
-    return options
 
 
 def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:

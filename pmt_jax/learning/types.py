@@ -9,6 +9,7 @@ import enum
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..config.settings import HYPER_FIELDS, Hyper
@@ -208,6 +209,17 @@ class Best:
     state: LearnerState
     reward: np.ndarray
     cost: np.ndarray
+
+    @classmethod
+    def initial(cls, state: LearnerState) -> Best:
+        """Before anything is known of a run of any number of seeds."""
+        nothing = np.full(state.update.shape, np.inf, np.float32)
+        return cls(_copy(state), -nothing, nothing)
+
+
+@jax.jit
+def _copy(state: LearnerState) -> LearnerState:
+    return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
 
 
 Metrics = dict[str, jax.Array]

@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import numerics
 from ..config.load import load_config, to_toml
@@ -407,12 +406,6 @@ def state_like(setup: Setup) -> LearnerState:
     return jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), (None, 0)), setup.hyper, keys)
 
 
-def initial_best(state: LearnerState) -> Best:
-    """Before anything is known of a run of any number of seeds."""
-    nothing = np.full(state.update.shape, np.inf, np.float32)
-    return Best(_copy(state), -nothing, nothing)
-
-
 def _what_it_is(folder: pathlib.Path) -> str:
     """Of a path that holds no run: why, and what to name instead."""
     if folder.is_file():
@@ -421,11 +414,6 @@ def _what_it_is(folder: pathlib.Path) -> str:
         return "there is no such folder"
     runs = sorted(str(file.parent) for file in folder.glob("*/config.toml"))
     return f"it holds {len(runs)} run(s); name one, as {runs[0]}" if runs else "it has no config.toml"
-
-
-@jax.jit
-def _copy(state: LearnerState) -> LearnerState:
-    return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
 
 
 def load_saved(
@@ -450,7 +438,7 @@ def load_saved(
         )
     with numerics.keys_of(recorded_versions(folder) or {}):
         like = state_like(setup)
-        return setup, saved.step, unpack(saved.packed, {"last": like, "best": jax.eval_shape(initial_best, like)})
+        return setup, saved.step, unpack(saved.packed, {"last": like, "best": jax.eval_shape(Best.initial, like)})
 
 
 _newest = processes.in_first(newest)

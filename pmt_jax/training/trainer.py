@@ -34,7 +34,7 @@ from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, duration
-from .run_folder import MATMUL_PRECISION, Rescue, RunFolder, initial_best
+from .run_folder import MATMUL_PRECISION, Rescue, RunFolder
 from .signals import Interrupts
 from .workers import WorkerLost, check_workers, start_workers
 
@@ -192,7 +192,7 @@ class Trainer:
     ) -> None:
         """Begins at the first `state`; `open` may replace it by a saved one."""
         self.setup, self.config, self.programs, self.folder, self.say = setup, setup.config, programs, folder, say
-        self.state, self.best = state, initial_best(state)
+        self.state, self.best = state, Best.initial(state)
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
         self.faults: collections.Counter[str] = collections.Counter()

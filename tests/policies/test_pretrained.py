@@ -24,7 +24,7 @@ from paths import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments
-from pmt_jax.learning.types import ActingState, LearnerState, RunningMoments, TrainState
+from pmt_jax.learning.types import ActingState, Best, LearnerState, RunningMoments, TrainState
 from pmt_jax.policies import evaluate, hub, numpy_policy, publish
 from pmt_jax.training import run_folder
 from pmt_jax.training.checkpoint import Checkpoints, Provenance
@@ -54,7 +54,7 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
     out.mkdir()
     run_folder.write_settings(out, run)
     checkpoints = Checkpoints(out)
-    known = dataclasses.replace(run_folder.initial_best(state), state=pushing(best))
+    known = dataclasses.replace(Best.initial(state), state=pushing(best))
     checkpoints.save(100, {"last": pushing(last), "best": known}, Provenance(run.config))
     checkpoints.close()
     return out
