@@ -29,7 +29,7 @@ class Case:
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: plain loops at once, 0 for one on each of all CPUs.
-      jobs: worker processes that share the seeds of a training and the CPUs; cases with more jobs than CPUs do not run.
+      workers: worker processes that share the seeds of a training and the CPUs; cases with more than CPUs do not run.
       settings: other settings of the training; alone, other options of the environment.
     """
 
@@ -44,7 +44,7 @@ class Case:
     rollout_length: int = 0
     devices: int = 1
     threads: int = 0
-    jobs: int = 1
+    workers: int = 1
     settings: Settings = ()
 
     def about(self) -> dict[str, Any]:
@@ -118,8 +118,8 @@ def _ruled(task: str, *settings: tuple[str, Any]) -> tuple[Case, ...]:
     return tuple(_training(task, "mappo_l", 1, 64, 64, *settings, *gains, what=rule) for rule, gains in rules.items())
 
 
-def _in_jobs(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
-    return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), jobs=count) for count in counts)
+def _in_workers(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
+    return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), workers=count) for count in counts)
 
 
 def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tuple[Case, ...]:
@@ -147,7 +147,7 @@ ROBOTS = tuple(
 
 BENCHES = {
     "ant": Bench(
-        "ant: control steps/s per engine beside plain loops, alone and training; seconds to start; memory, GB",
+        "ant: control steps/s per engine next to plain loops, alone and training; seconds to start; memory, GB",
         (
             *(Case("start", "ant_2x4", what, method="mappo_l") for what in ("empty cache", "second start")),
             Case("start", "ant_2x4", "256 x 64", method="mappo_l", num_envs=256, rollout_length=64),
@@ -171,10 +171,10 @@ BENCHES = {
             *_alone("ant_2x4", (64, 256), physics="mujoco"),
             *(_training("ant_2x4", "mappo_l", 1, 256, 32, devices=count) for count in (1, 2, 4)),
             _training("ant_2x4", "mappo_l", 1, 64, 64),
-            *_in_jobs("ant_2x4", 8, (1, 2, 4, 8)),
-            *_in_jobs("ant_2x4", 16, (1, 4, 8, 16)),
+            *_in_workers("ant_2x4", 8, (1, 2, 4, 8)),
+            *_in_workers("ant_2x4", 16, (1, 4, 8, 16)),
         ),
-        (*_plain("ant_2x4")[1:], *_in_jobs("ant_2x4", 2, (1, 2))),
+        (*_plain("ant_2x4")[1:], *_in_workers("ant_2x4", 2, (1, 2))),
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
@@ -182,7 +182,7 @@ BENCHES = {
         _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(
-        "hands: control steps/s per engine beside plain loops; CPU-seconds to compile",
+        "hands: control steps/s per engine next to plain loops; CPU-seconds to compile",
         (
             *_plain("hand_over_2x6"),
             *_alone("hand_over_2x6", (64, 256), physics="mujoco"),
@@ -191,7 +191,7 @@ BENCHES = {
         (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
     ),
     "velocity": Bench(
-        "velocity tasks: control steps/s of each robot per engine beside plain loops",
+        "velocity tasks: control steps/s of each robot per engine next to plain loops",
         tuple(
             case
             for task in ROBOTS
@@ -217,7 +217,7 @@ BENCHES = {
         _ruled("switch", *_LIKE_THE_ANT),
     ),
     "grid": Bench(
-        "power flows/s beside other tools; environment steps/s in a scan and with a call a step",
+        "power flows/s next to other tools; environment steps/s in a scan and with a call a step",
         (
             *(
                 Case("power flow", network, what, num_envs=batch)

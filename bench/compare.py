@@ -1,7 +1,7 @@
 """Results against older ones: which figures became better or worse, and by how much.
 
-A figure is told from its name's ending (bench/records.py): rates should be large, seconds and bytes small. Only results
-of the same kind of device are compared, on a CPU also of the same CPU and number of threads.
+The ending of a figure's name says which way is better (bench/records.py): rates should be large, seconds and bytes
+small. Only results of the same kind of device are compared, on a CPU also of the same CPU and number of threads.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import collections
 from typing import Any, NamedTuple
 
-from .records import Report, Row
+from .records import Record, Report
 
 LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
 SUBJECT = ("kind", "task", "name", "what", "method", "physics", "solver")
-SIZES = ("threads", "devices", "jobs", "seeds", "num_envs", "rollout_length")
+SIZES = ("threads", "devices", "workers", "seeds", "num_envs", "rollout_length")
 WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 
 
@@ -31,7 +31,7 @@ def more_is_better(name: str) -> bool:
     return name.endswith("_second") or name in SHARES
 
 
-def label(row: Row) -> str:
+def label(row: Record) -> str:
     """What a row is about, for people."""
     words = [str(row[name]) for name in SUBJECT if row.get(name)]
     return ", ".join([*words, *(f"{name} {row[name]:,}" for name in SIZES if name in row)])

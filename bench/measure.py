@@ -1,7 +1,7 @@
 """Cases become programs, programs take turns, turns become rows.
 
 A row says what its case is about, the median rate of its turns and the `rates` of all of them in order, so that ratios
-can be taken turn by turn (`bench/forms/tables.py`). Each turn waits a while for other work on the machine to pause and
+can be taken turn by turn (`bench/tables/speed.py`). Each turn waits a while for other work on the machine to pause and
 notes how much of it went on.
 """
 
@@ -27,12 +27,12 @@ from envs.physics import usable_cpus
 from envs.vector import restart
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
-from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
+from pmt_jax.training.workers import start_workers
 
 from . import grid, once, plain, substep
 from .cases import Bench, Build, Case, Program
-from .records import Row
+from .records import Record
 
 UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
 
@@ -49,14 +49,14 @@ FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 
 
-def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
+def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Record]:
     """Measures cases; if one fails, its row says why."""
     found, failed = {}, Failures()
     for case in [case for case in cases if case.kind in ONCE]:
         await_quiet(6 * effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
-    fits = [case for case in cases if case.devices <= jax.device_count() and case.jobs <= max(2, usable_cpus())]
+    fits = [case for case in cases if case.devices <= jax.device_count() and case.workers <= max(2, usable_cpus())]
     timed = [case for case in fits if case.kind not in ONCE]
     for group in [timed] if bench.by_turns else [[case] for case in timed]:
         programs = _compiled(group, failed, bench.on == "gpus", say)
@@ -66,7 +66,7 @@ def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str
             yield _row(case, found, failed, say)
 
 
-def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[str], None]) -> Row:
+def _row(case: Case, found: dict[Case, Record], failed: Failures, say: Callable[[str], None]) -> Record:
     row = case.about() | ({"failed": failed[case]} if case in failed else found[case])
     say(str({name: value for name, value in row.items() if name != "rates"}))
     return row
@@ -152,11 +152,11 @@ def training(case: Case) -> Build:
     engine = {"physics": case.physics} if case.physics else {}
     settings = sizes | engine | {"log_interval": updates, "steps": steps}
     setup = make_setup(load_config(case.task, method=case.method, **settings, **dict(case.settings)))
-    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), jobs=case.jobs)
+    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), workers=case.workers)
 
     def build() -> Program:
         begin = time.perf_counter()
-        state, programs = (jobs.start if case.jobs > 1 else compile_run)(setup, lambda _: None)
+        state, programs = (start_workers if case.workers > 1 else compile_run)(setup, lambda _: None)
         facts = {"physics": setup.vector.env.engine, "compile_seconds": round(time.perf_counter() - begin, 2)}
         box = [state]
 
@@ -211,7 +211,7 @@ def _turn(program: Program, seconds: float) -> Turn:
     return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
 
 
-def _medians(case: Case, turns: Sequence[Turn]) -> Row:
+def _medians(case: Case, turns: Sequence[Turn]) -> Record:
     unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
     busy = [turn.gpu for turn in turns if turn.gpu is not None]
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none

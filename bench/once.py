@@ -23,32 +23,33 @@ from envs.voltage.certificate import certify
 from envs.voltage.control import VoltageControl
 from pmt_jax import load_config, make_setup, tasks
 from pmt_jax.learning.evaluation import EVALUATION_KEY
+from pmt_jax.learning.types import Best
 from pmt_jax.policies.evaluate import evaluate_baseline
-from pmt_jax.training import run_folder, trainer
+from pmt_jax.training import trainer
 from pmt_jax.training.checkpoint import Checkpoints, Provenance, newest, unpack
 from pmt_jax.training.compile import compile_run
 
 from .cases import Case
-from .records import Row
+from .records import Record
 
 CHUNKS, SAVES = 8, 8
 CACHES = ("XDG_CACHE_HOME", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")  # of JAX, of Warp's kernels, of the driver
 
 
-def start(case: Case) -> Row:
+def start(case: Case) -> Record:
     """Trains in a process of its own with empty caches; the second start has what the first left in them."""
     folder, row = _first_start(dataclasses.replace(case, what="empty cache"))
     return _train(pathlib.Path(folder.name), case) if case.what == "second start" else row
 
 
 @functools.cache
-def _first_start(case: Case) -> tuple[tempfile.TemporaryDirectory[str], Row]:
+def _first_start(case: Case) -> tuple[tempfile.TemporaryDirectory[str], Record]:
     """The folder that has the caches until this process ends, and the row."""
     folder = tempfile.TemporaryDirectory()
     return folder, _train(pathlib.Path(folder.name), case)
 
 
-def _train(folder: pathlib.Path, case: Case) -> Row:
+def _train(folder: pathlib.Path, case: Case) -> Record:
     """Two updates of the case's size, or 4,096 steps of the task's own size; what they took."""
     out = pathlib.Path(tempfile.mkdtemp(dir=folder))
     command = [sys.executable, "-m", "pmt_jax", "train", case.task, "--method", case.method, "--log-interval", "1"]
@@ -81,7 +82,7 @@ def _train(folder: pathlib.Path, case: Case) -> Row:
     }
 
 
-def checkpoint(case: Case) -> Row:
+def checkpoint(case: Case) -> Record:
     """Medians over saves, loads and chunks without the first of each, which warms up.
 
     The run is trained for a while first, so that its weights compress as those of a real run do. `overhead` is the
@@ -89,13 +90,13 @@ def checkpoint(case: Case) -> Row:
     """
     setup = make_setup(load_config(case.task, method=case.method, num_envs=case.num_envs))
     state, programs = compile_run(setup, lambda _: None)
-    box = [state, run_folder.initial_best(state)]
+    box = [state, Best.initial(state)]
 
     def train() -> None:
         box[0], _ = programs.chunk(box[0], 1)
 
     def keep() -> None:
-        box[1] = run_folder.Best(programs.take(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)
+        box[1] = Best(programs.where_seed(np.ones(1, bool), box[1].state, box[0]), box[1].reward, box[1].cost)
 
     chunk, copy = ([_seconds(work, box) for _ in range(CHUNKS)] for work in (train, keep))
     saved = {"last": box[0], "best": box[1]}
@@ -122,13 +123,13 @@ def _seconds(work: Callable[[], Any], then: Any = None) -> float:
     return time.perf_counter() - begin
 
 
-def baseline(case: Case) -> Row:
+def baseline(case: Case) -> Record:
     """Means over episodes from the starts that `pmt eval` has."""
     found = evaluate_baseline(case.task, case.what, case.num_envs, {})
     return {name: round(float(x[0]), 6) for name, x in found.items() if isinstance(x, tuple)}
 
 
-def certificate(case: Case) -> Row:
+def certificate(case: Case) -> Record:
     """What dispatches can and cannot do in the steps of the episodes that `baseline` has.
 
     `reached` are shares of steps with every bus in the band, under the best dispatch found; `possible` are those that

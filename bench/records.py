@@ -19,8 +19,8 @@ from pmt_jax.errors import UsageError
 from pmt_jax.files import replace_text
 from pmt_jax.tasks import installed_version
 
-Row = dict[str, Any]
-Rows = list[Row]
+Record = dict[str, Any]
+Records = list[Record]
 Report = dict[str, Any]  # conditions and rows
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -29,7 +29,7 @@ PACKAGES += ("pandapower", "lightsim2grid", "power-grid-model", "orbax-checkpoin
 _BEGIN = time.monotonic()
 
 
-def write(out: pathlib.Path, rows: Rows, command: str) -> None:
+def write(out: pathlib.Path, rows: Records, command: str) -> None:
     """Writes `rows` below their `conditions`; the old file stays until all is written.
 
     A figure's name ends in its unit: `_second` for a rate (more is better); `_seconds`, `_gb` (1e9 bytes) and `_mb`

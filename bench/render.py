@@ -1,12 +1,13 @@
 """Tables in the documentation, made from bench/results.
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
-bench/forms/tables.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` means the
+bench/tables/speed.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` means the
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
-`paper:FILE` for means and standard deviations beside the paper's, `summary:FILE+FILE` for methods by tasks,
+`paper:FILE` for means and standard deviations next to the paper's, `summary:FILE+FILE` for methods by tasks,
 `overview:FILE+FILE` for tasks by methods with PID, `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each
-pair of methods. The study's forms are in bench/forms/study.py and rounds.py; those of tasks, settings and methods, as
-`observation:ant_2x4`, in pages.py.
+pair of methods. The studies' tables are in study.py and later_studies.py; those of tasks, settings and methods, as
+`observation:ant_2x4`, in pages.py. In a sentence, `<!-- bench: within:FILE:METHOD:LIMIT -->18<!-- /bench -->` is a
+number, see values.py.
 """
 
 from __future__ import annotations
@@ -20,23 +21,24 @@ from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
 from . import records
-from .forms import pages, rounds, runs, study
-from .forms.tables import TABLES, Reports
+from .tables import later_studies, pages, runs, study, values
+from .tables.speed import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r"(<!-- bench: (\S+) -->)([^<\n]*)(<!-- /bench -->)")
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
-STORED = {**runs.FORMS, **study.FORMS, **rounds.FORMS}
+STORED = {**runs.KINDS, **study.KINDS, **later_studies.KINDS}
 
 
 def documents() -> list[pathlib.Path]:
     """The Markdown files that have blocks."""
     candidates = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-    return [path for path in candidates if MARK.search(path.read_text())]
+    return [path for path in candidates if MARK.search(text := path.read_text()) or NUMBER.search(text)]
 
 
 def render(text: str, reports: Reports) -> str:
-    """`text` with its blocks made anew.
+    """`text` with its blocks and numbers made anew.
 
     Raises:
       UsageError: a block names no table, or does not end.
@@ -44,11 +46,11 @@ def render(text: str, reports: Reports) -> str:
 
     def block(found: re.Match[str]) -> str:
         begin, name, _, end = found.groups()
-        form, _, file = name.partition(":")
-        if form in STORED:
-            return f"{begin}{STORED[form](records.RESULTS / f'{file}.json')}\n{end}"
-        if form in pages.FORMS:
-            return f"{begin}{pages.FORMS[form](file)}\n{end}"
+        kind, _, file = name.partition(":")
+        if kind in STORED:
+            return f"{begin}{STORED[kind](records.RESULTS / f'{file}.json')}\n{end}"
+        if kind in pages.KINDS:
+            return f"{begin}{pages.KINDS[kind](file)}\n{end}"
         if name not in TABLES:
             raise UsageError(f"unknown table '{name}'{did_you_mean(name, TABLES)}")
         return f"{begin}{TABLES[name](reports)}\n{end}"
@@ -56,7 +58,7 @@ def render(text: str, reports: Reports) -> str:
     rendered, blocks = BLOCK.subn(block, text)
     if 2 * blocks != len(MARK.findall(text)):
         raise UsageError("a block that begins with <!-- bench: NAME --> does not end with <!-- /bench -->")
-    return rendered
+    return NUMBER.sub(lambda found: f"{found[1]}{values.number(found[2])}{found[4]}", rendered)
 
 
 def documents_anew(check: bool, say: Callable[[str], None] = print) -> int:

@@ -25,7 +25,7 @@ PROBE = "import jax; print(jax.device_count(), jax.devices()[0].device_kind)"
 
 
 def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: int, only: str, say: Say) -> int:
-    """Runs benches one after the other, then shows their figures beside those of the last commit.
+    """Runs benches one after the other, then shows their figures next to those of the last commit.
 
     Args:
       names: of benches; none for all that this machine has the devices for.
@@ -38,7 +38,7 @@ def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: in
     partly = quick or bool(threads) or bool(only)
     benches, out = chosen(names), folder(out, partly)
     out.mkdir(parents=True, exist_ok=True)
-    committed = _committed(say)
+    committed = last_results(say)
     count, device = devices() if any(BENCHES[name].on != "cpu" for name in benches) else (0, "cpu")
     done, failed, stopped = [], [], False
     for number, name in enumerate(benches, 1):
@@ -87,7 +87,7 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
         records.write(out, rows, f"python -m bench run {name}{flags}")
 
 
-def _wanted(row: records.Row, only: str) -> bool:
+def _wanted(row: records.Record, only: str) -> bool:
     return all(word.strip() in compare.label(row) for word in only.split(","))
 
 
@@ -124,7 +124,8 @@ def _child(words: Sequence[str], on_cpu: bool, result: pathlib.Path, say: Say) -
     return True
 
 
-def _committed(say: Say) -> dict[str, records.Report]:
+def last_results(say: Say) -> dict[str, records.Report]:
+    """The results of the last commit; none without a repository."""
     try:
         return records.load("HEAD")
     except UsageError:

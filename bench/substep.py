@@ -16,13 +16,13 @@ from envs.ant.walls import model
 from envs.physics.warp_engine import WarpEngine
 
 from .cases import Case
-from .records import Row
+from .records import Record
 
 WARM, REPEATS, TURNS = 20, 40, 5
 SLOWEST = 12  # kernels in a row
 
 
-def substep(case: Case) -> Row:
+def substep(case: Case) -> Record:
     """Seconds of a step in a captured graph, also with a solver of one iteration, and its kernels one by one.
 
     The graph runs its kernels back to back. Timed one by one they take longer, so these times only rank them.
@@ -47,7 +47,7 @@ def substep(case: Case) -> Row:
     }
 
 
-def kernels(launches: list[tuple[str, float]]) -> Row:
+def kernels(launches: list[tuple[str, float]]) -> Record:
     """How many launches there were, and for the slowest kernels: name, launches, milliseconds of all of them."""
     found: dict[str, list[float]] = collections.defaultdict(list)
     for name, milliseconds in launches:

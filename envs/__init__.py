@@ -70,11 +70,13 @@ def make(name: str, **options: Any) -> Env:
       >>> make("lane").spec.num_agents
       2
     """
-    known = task_options(name)
+    cls, fixed = _class(name)
+    known = _options(cls, fixed)
     for option in options:
+        if option == "physics" and option not in known:
+            raise TaskError(f"task '{name}' is plain JAX and has no physics engine to choose; leave physics = auto")
         if option not in known:
             raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
-    cls, fixed = _class(name)
     return user.build(cls, name, options) if user.is_file(name) else cls(**fixed, **options)
 
 
@@ -93,7 +95,10 @@ def task_options(name: str) -> dict[str, Any]:
     Raises:
       TaskError: unknown name.
     """
-    cls, fixed = _class(name)
+    return _options(*_class(name))
+
+
+def _options(cls: Callable[..., Any], fixed: Mapping[str, Any]) -> dict[str, Any]:
     return {p.name: p.default for p in inspect.signature(cls).parameters.values() if p.name not in fixed}
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import numbers
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -122,7 +122,7 @@ class Env(Protocol):
         ...
 
 
-Policy = Callable[[State], jax.Array]  # a state of one environment -> action [N, A]
+Controller = Callable[[State], jax.Array]  # a state of one environment -> action [N, A]
 
 
 Raw = Callable[[State], dict[str, Any]]  # the quantities of a state that a picture reads, by name
@@ -191,14 +191,16 @@ class Declarations:
       picture: how an episode is drawn.
       baselines: name -> a function that makes a policy which needs no training.
       overflow: the name in `info` that is above 0 if the physics lost contacts, which makes a step wrong.
+      kernels: what the physics needs compiled besides XLA's programs, as calls for any threads; only warp needs some.
     """
 
     observation: Blocks = ()
     state: Blocks = ()
     actions: tuple[tuple[str, ...], ...] = ()
     picture: Plain | Scene | NetworkMap = Plain()
-    baselines: Mapping[str, Callable[[], Policy]] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, Callable[[], Controller]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None
+    kernels: Callable[[], Sequence[Callable[[], Any]]] = tuple
 
 
 def shares_cost(env: Env) -> bool:

@@ -152,14 +152,10 @@ def restart(env: Env, done: jax.Array, state: State, key: jax.Array, resets_all:
     return jax.lax.while_loop(lambda left: left[0].any(), reset_some, (done, state))[1]
 
 
-def felt_cost(
-    cost: jax.Array, key: jax.Array, cost_seen: jax.Array | float, cost_false: jax.Array | float
-) -> jax.Array:
-    """The cost that a team notices: harm that is seldom felt, and false alarms.
+def observed_cost(cost: jax.Array, key: jax.Array, cost_seen: jax.Array | float) -> jax.Array:
+    """The cost that the learner observes: a step's cost with probability `cost_seen`, else 0.
 
-    A costly step is felt with probability `cost_seen`; a safe step (no cost for any agent) is felt as a cost of 1 for
-    all agents with probability `cost_false`. There is one draw an environment for the whole team. With 1 and 0 the
-    result is `cost`, bit for bit.
+    There is one draw an environment for the whole team. With 1 the result is `cost`, bit for bit.
 
     Args:
       cost: [B, N, K], the true cost of one step; key: of this step's draws.
@@ -168,9 +164,7 @@ def felt_cost(
       [B, N, K].
     """
     draw = jax.random.uniform(key, cost.shape[:1])
-    costly = (cost > 0).any((-2, -1))
-    felt = _where(costly & (draw >= cost_seen), jnp.zeros_like(cost), cost)
-    return _where(~costly & (draw < cost_false), jnp.ones_like(cost), felt)
+    return _where(draw >= cost_seen, jnp.zeros_like(cost), cost)
 
 
 def out_of_range(cost: jax.Array) -> jax.Array:

@@ -18,7 +18,7 @@ Note = Callable[[str], object]  # called with a sentence about what is left out
 
 @contextlib.contextmanager
 def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A file beside `out` to write to, which replaces `out` when all has gone well.
+    """A file next to `out` to write to, which replaces `out` when all has gone well.
 
     Raises:
       UsageError: the folder cannot be written.
@@ -40,7 +40,7 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
 
 @contextlib.contextmanager
 def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A new folder beside `out` to write to; when all has gone well it becomes `out`, or its files move into it.
+    """A new folder next to `out` to write to; when all has gone well it becomes `out`, or its files move into it.
 
     Raises:
       UsageError: the folder cannot be written.

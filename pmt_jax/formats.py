@@ -11,23 +11,23 @@ from .tasks import did_you_mean
 Cells = Sequence[str]
 
 
-def number(x: float | None, form: str = ".4g") -> str:
+def number(x: float | None, spec: str = ".4g") -> str:
     """A number as a cell; - for what is unknown."""
-    return "-" if x is None else format(x, form)
+    return "-" if x is None else format(x, spec)
 
 
-def write(head: Cells, body: Sequence[Cells], form: str = "text", notes: Sequence[str] = ()) -> str:
+def write(head: Cells, body: Sequence[Cells], layout: str = "text", notes: Sequence[str] = ()) -> str:
     """A table with its notes, which ends in a newline.
 
     Args:
-      form: text, markdown or latex.
+      layout: text, markdown or latex.
 
     Raises:
       UsageError: another format.
     """
-    if form not in WRITERS:
-        raise UsageError(f"unknown format '{form}'{did_you_mean(form, WRITERS)}")
-    return WRITERS[form](head, body, notes) + "\n"
+    if layout not in WRITERS:
+        raise UsageError(f"unknown format '{layout}'{did_you_mean(layout, WRITERS)}")
+    return WRITERS[layout](head, body, notes) + "\n"
 
 
 def markdown(head: Cells, body: Iterable[Cells], notes: Sequence[str] = ()) -> str:

@@ -54,9 +54,9 @@ class Limits:
         return None if isinstance(given, float) and math.isnan(given) else cls(_for_each(given, costs))
 
     @classmethod
-    def of_run(cls, config: Config, spec: EnvSpec, horizon: int) -> Limits:
+    def of_run(cls, config: Config, spec: EnvSpec) -> Limits:
         """What the learner holds costs to, as it observes them: the settings', or what the task's amount to there."""
-        own = cls.of_task(spec).observed(config.cost_seen, config.cost_false, horizon)
+        own = cls.of_task(spec).observed(config.cost_seen)
         return cls.configured(config, spec.num_costs) or own
 
     @classmethod
@@ -76,12 +76,12 @@ class Limits:
         """The sum over costs."""
         return float(sum(self.each))
 
-    def observed(self, cost_seen: float, cost_false: float, horizon: int) -> Limits:
-        """Limits d on true costs as a learner observes them: cost_seen d + cost_false (horizon - d)."""
-        return Limits(tuple(cost_seen * d + cost_false * (horizon - d) for d in self.each))
+    def observed(self, cost_seen: float) -> Limits:
+        """Limits on true costs, of which each is observed with that probability, as limits on observed ones."""
+        return Limits(tuple(cost_seen * d for d in self.each))
 
     def true(self, cost_seen: float) -> Limits:
-        """Limits on observed costs as limits on true ones, of which each is seen with that probability."""
+        """Limits on observed costs as limits on true ones, of which each is observed with that probability."""
         return Limits(tuple(d / cost_seen for d in self.each))
 
     def excess(self, costs: Any) -> Any:
@@ -162,7 +162,7 @@ def of_agents(known: Mapping[str, Any], name: str) -> list[Any]:
 
 
 def base(name: str) -> str:
-    """The column beside which `columns` puts this one; the name itself if none.
+    """The column next to which `columns` puts this one; the name itself if none.
 
     Examples:
       >>> base("lambda/agent_1/cost_0"), base("cost_limit/0"), base("critic/loss")

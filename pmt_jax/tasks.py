@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from .errors import UsageError
 
 if TYPE_CHECKING:
-    from envs.base import Env, EnvSpec, Policy, State, declarations, shares_cost
+    from envs.base import Controller, Env, EnvSpec, State, declarations, shares_cost
     from envs.columns import Column
-    from envs.vector import Outcome, VectorEnv, VectorState, felt_cost
+    from envs.vector import Outcome, VectorEnv, VectorState, observed_cost
 
 __all__ = [
     "Env",
@@ -35,9 +35,8 @@ __all__ = [
     "engines",
     "explain_options",
     "installed_version",
-    "felt_cost",
+    "observed_cost",
     "is_file",
-    "kernels",
     "make",
     "names",
     "options",
@@ -59,7 +58,7 @@ def _envs() -> types.ModuleType:
 
 _CONTRACT = {"Env": "base", "EnvSpec": "base", "State": "base", "declarations": "base"}
 _CONTRACT |= {"shares_cost": "base"}
-_CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "felt_cost": "vector"}
+_CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "observed_cost": "vector"}
 
 
 def __getattr__(name: str) -> Any:
@@ -94,7 +93,7 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     return _envs().errors.did_you_mean(word, choices)
 
 
-def baseline(env: Env, name: str) -> Policy:
+def baseline(env: Env, name: str) -> Controller:
     """A policy that needs no training: state -> action [N, A].
 
     Raises:
@@ -106,13 +105,6 @@ def baseline(env: Env, name: str) -> Policy:
     if name not in known:
         raise UsageError(f"unknown policy '{name}'{did_you_mean(name, known)}")
     return known[name]()
-
-
-def kernels(env: Env) -> list[Callable[[], Any]]:
-    """What `env` needs compiled besides XLA's programs, which only Warp's physics does; calls for any threads."""
-    if env.engine != "warp":
-        return []
-    return importlib.import_module(f"{_envs().__name__}.physics.warp_kernels").needed()
 
 
 def columns(name: str) -> Mapping[str, Column]:
@@ -176,8 +168,6 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
     """
     envs = _envs()
     try:
-        if physics != "auto" and "physics" not in envs.task_options(name):
-            raise UsageError(f"task '{name}' is plain JAX and has no physics engine to choose; leave physics = auto")
         if physics != "auto":
             options["physics"] = physics
         return envs.make(name, **options)

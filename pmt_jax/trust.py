@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator
 from .errors import UsageError
 from .tasks import is_file, task_file
 
-_OURS = ("envs", "pmt_jax")  # imported long before, so that no file beside a task's takes their place
+_OURS = ("envs", "pmt_jax")  # imported long before, so that no file next to a task's takes their place
 
 _trusts = contextvars.ContextVar("trusts", default=False)
 
@@ -99,7 +99,7 @@ def remember(task: str) -> None:
 
 
 def digest(file: pathlib.Path) -> str:
-    """SHA-256 of a Python file and of all that it may load from beside it.
+    """SHA-256 of a Python file and of all that it may load from next to it.
 
     That is: modules in the file's folder that it imports, and Python files that it names as text; of each, the same.
     They are found by reading, so that nothing is executed. What a file composes at run time cannot be found.
@@ -119,7 +119,7 @@ def digest(file: pathlib.Path) -> str:
 
 
 def _named_in(content: bytes, path: pathlib.Path, top: pathlib.Path) -> list[pathlib.Path]:
-    """The files that the source in `path` names, as far as they lie beside it, or beside the task's in `top`."""
+    """The files that the source in `path` names, as far as they lie next to it, or next to the task's in `top`."""
     try:
         nodes = list(ast.walk(ast.parse(content)))
     except (SyntaxError, ValueError, RecursionError, MemoryError):  # it cannot be executed either

@@ -24,7 +24,7 @@ from envs.physics import warp_engine
 from envs.physics.fused import gpu, threads
 from envs.physics.fused.model import tables
 from envs.velocity import robots
-from places import DATA, ROOT
+from paths import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play
@@ -305,9 +305,9 @@ def test_a_seed_beside_others_moves_as_it_does_alone():
 
         return jax.lax.scan(step, state, jax.random.split(key, 100))[0].carry.physics
 
-    beside = jax.jit(jax.vmap(after))(starts, keys)
+    together = jax.jit(jax.vmap(after))(starts, keys)
     alone = jax.jit(after)(jax.tree.map(lambda x: x[1], starts), keys[1])
-    assert same(jax.tree.map(lambda x: x[1], beside), alone)
+    assert same(jax.tree.map(lambda x: x[1], together), alone)
 
 
 def test_training_repeats_bit_for_bit():

@@ -71,8 +71,8 @@ def test_episodes_of_training_are_within_if_every_agent_and_cost_is(data: st.Dat
     )
     batch.done = batch.finished
     limit = jnp.asarray(limits.each, jnp.float32) if len(limits.each) > 1 else jnp.float32(limits.total)
-    hyper: Any = types.SimpleNamespace(cost_limit=limit, cost_seen=1.0, cost_false=0.0)
-    kept = rollout.limits_kept(batch, hyper, 25)
+    hyper: Any = types.SimpleNamespace(cost_limit=limit, cost_seen=1.0)
+    kept = rollout.limit_metrics(batch, hyper)
     each = [beyond(one, limits) for one in cost[finished]]
     within = [all(x == 0 for agent in one for x in agent) for one in each]
     furthest = [sum(max(agent[k] for agent in one) for k in range(len(limits.each))) for one in each]
@@ -113,14 +113,14 @@ def test_the_best_state_is_chosen_by_every_agent_and_cost(data: st.DataObject, l
     cost = data.draw(costs(6, agents, len(limits.each)))
     reward = data.draw(st.permutations(range(6)))
     best = types.SimpleNamespace(state=np.array([-1]), reward=np.array([-np.inf]), cost=np.array([np.inf]))
-    take = lambda improved, old, new: np.where(improved, new, old)  # noqa: E731
+    where_seed = lambda improved, old, new: np.where(improved, new, old)  # noqa: E731
     trainer: Any = types.SimpleNamespace(
-        best=best, config=types.SimpleNamespace(eval_interval=0), programs=types.SimpleNamespace(take=take)
+        best=best, config=types.SimpleNamespace(eval_interval=0), programs=types.SimpleNamespace(where_seed=where_seed)
     )
     for at in range(6):
         trainer.state = np.array([at])
         line = written_row(cost[at], limits, broken=None, episode_reward=float(reward[at]))
-        Trainer._keep_best(trainer, [line])
+        Trainer.keep_best(trainer, [line])
     chosen = int(trainer.best.state[0])
     worst = [max(itertools.chain(*beyond(one, limits))) for one in cost]
     if 0 in worst:

@@ -66,8 +66,8 @@ def setting(name: str, value: Any) -> Iterator[None]:
 @pytest.fixture
 def quick_doctor(monkeypatch: pytest.MonkeyPatch):
     """A doctor that starts no processes of its own."""
-    monkeypatch.setattr(doctor, "_rendering", lambda: iter(()))
-    monkeypatch.setattr(doctor, "_cache", lambda: doctor.Finding("ok", "compile cache", ""))
+    monkeypatch.setattr(doctor, "check_rendering", lambda: iter(()))
+    monkeypatch.setattr(doctor, "check_cache", lambda: doctor.Finding("ok", "compile cache", ""))
 
 
 def sentence(cli: Any, *command: object) -> str:
@@ -148,7 +148,7 @@ def test_doctor_says_what_xla_does_not_take(flags: str | None, cli, monkeypatch,
 @pytest.mark.parametrize("error", [RuntimeError("No such platform.\nMore."), AssertionError()])
 def test_doctor_says_that_there_is_no_device(error: Exception, cli, monkeypatch, quick_doctor):
     monkeypatch.setattr(jax, "devices", lambda: (_ for _ in ()).throw(error))
-    monkeypatch.setattr(doctor, "_engines", lambda: iter(()))
+    monkeypatch.setattr(doctor, "check_engines", lambda: iter(()))
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     code, out, _ = cli("doctor")
     assert code == 1 and "devices             JAX finds no device with JAX_PLATFORMS=cuda" in out

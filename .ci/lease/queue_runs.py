@@ -19,7 +19,7 @@ GPUS = 2 if SMOKE else len((OUT / "gpus").read_text().splitlines())
 BEGIN = time.time() if SMOKE else float((HERE / "asked").read_text())
 END = 900.0 if SMOKE else jobs.END
 Running = tuple[int, str, subprocess.Popen[bytes]]
-ENVIRONMENT = {  # beside what setup.sh exports
+ENVIRONMENT = {  # next to what setup.sh exports
     "PYTHONUNBUFFERED": "1",
     "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
     "XDG_CACHE_HOME": "/tmp/cache",

@@ -10,7 +10,8 @@ from pmt_jax import load_config
 from pmt_jax.errors import UsageError
 
 from .contest import PEERS, SIZES
-from .learners import TASK, Arguments, Report
+from .learners import TASK, Arguments
+from .report import Report
 
 
 def main() -> None:

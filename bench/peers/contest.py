@@ -14,8 +14,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from .. import records, runner
-from ..records import Row
+from ..records import Record
 from . import learners
+from .report import Report
 
 Lines = list[dict[str, Any]]
 SIZES = ("num_envs", "rollout_length", "epochs", "minibatches")
@@ -35,7 +36,7 @@ class Peer(NamedTuple):
     name: str
     task: str
     networks: str
-    learn: Callable[[learners.Arguments, learners.Report], None]
+    learn: Callable[[learners.Arguments, Report], None]
     method: str = "mappo_l"
 
 
@@ -77,7 +78,7 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
     shape = (16, 16) if quick else (64, 64) if device == "cpu" else (2048, 8)
     sizes: dict[str, int] = dict(zip(SIZES, (*shape, 5, 8), strict=True))
     flags = " --quick" * quick + " --jaxmarl FOLDER" * bool(jaxmarl)
-    turns: dict[str, list[Row]] = {name: [] for name in PEERS}
+    turns: dict[str, list[Record]] = {name: [] for name in PEERS}
     caches = tempfile.TemporaryDirectory()  # of compiled programs and kernels, empty in a peer's first turn
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # naming the device then takes no memory
     for turn in range(effort.turns):
@@ -119,7 +120,7 @@ def _turn(name: str, seconds: float, seed: int, sizes: dict[str, int], jaxmarl: 
         return [{"begin": begin}, *found]
 
 
-def figures(lines: Lines, seconds: float) -> Row:
+def figures(lines: Lines, seconds: float) -> Record:
     """A turn's facts and figures: the rate after the first update, reward and cost in the last tenth of its time."""
     updates = [line for line in lines if "steps" in line]
     facts = {name: x for line in lines if "steps" not in line for name, x in line.items()}
@@ -136,7 +137,7 @@ def figures(lines: Lines, seconds: float) -> Row:
     return found
 
 
-def row(peer: Peer, sizes: dict[str, int], turns: list[Row]) -> Row:
+def row(peer: Peer, sizes: dict[str, int], turns: list[Record]) -> Record:
     """A peer's row: median rate, seconds of a cold start to the first update, reward and cost of each turn."""
     about = {"kind": "peer", "name": peer.name, "task": peer.task, "networks": peer.networks}
     about |= sizes if peer.networks != "none" else {}

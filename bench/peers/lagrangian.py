@@ -21,7 +21,7 @@ from envs import adapters
 from envs.base import Env, EnvSpec
 from pmt_jax import Config
 
-from .learners import Report
+from .report import Report
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 

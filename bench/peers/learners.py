@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import json
-import math
-import os
 import pathlib
 import sys
-import time
 import types
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -25,35 +21,13 @@ from pmt_jax.errors import UsageError
 from pmt_jax.training.compile import compile_run
 from pmt_jax.training.run_folder import MATMUL_PRECISION
 
-from .. import measure
 from ..cases import Case
 from ..plain import plain_loop
+from .report import Report
 
 TASK = "ant_2x4"
 FOREVER = 100_000_000  # environment steps; the clock ends training long before
 IPPO = "baselines/IPPO/ippo_ff_mabrax.py"
-
-
-class Report:
-    """Writes a line of JSON per update; ends the process `seconds` after the first update, which compiles."""
-
-    def __init__(self, out: pathlib.Path, seconds: float) -> None:
-        self._out, self._seconds = out.open("w", buffering=1), seconds
-        self._watch: measure.Watch | None = None
-
-    def about(self, **facts: Any) -> None:
-        """What the row says besides its figures."""
-        self._out.write(json.dumps(facts) + "\n")
-
-    def __call__(self, steps: int, reward: Any = None, cost: Any = None) -> None:
-        """`steps` so far, over all environments; reward and cost of recent episodes, NaN or None if none ended."""
-        self._watch = self._watch or measure.Watch()
-        scores = {name: float(x) for name, x in (("reward", reward), ("cost", cost)) if x is not None}
-        known = {name: x for name, x in scores.items() if math.isfinite(x)}
-        self._out.write(json.dumps({"time": time.time(), "steps": steps, **known}) + "\n")
-        if self._watch.wall >= self._seconds:
-            self._out.write(json.dumps({"other_work_cpus": round(self._watch.others, 2)}) + "\n")
-            os._exit(0)  # also out of a callback of a compiled loop
 
 
 class Arguments(NamedTuple):

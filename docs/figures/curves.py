@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
-from bench.forms import runs
+from bench.tables import runs
 from pmt_jax.studies import plot
 from pmt_jax.studies.run_log import Group
 
@@ -53,7 +53,7 @@ GRID_PANELS = {  # Fig. 3 of the paper
 
 
 def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] = PANELS) -> None:
-    """Two panels of one task: the mean over seeds with the method's name beside it, and the seeds' range in a band."""
+    """Two panels of one task: the mean over seeds with the method's name next to it, and the seeds' range in a band."""
     with rc_context(style.FONT):
         figure = Figure(figsize=(10, 4.2), layout="constrained")
         for axis, (name, title) in zip(figure.subplots(1, 2), panels.items(), strict=True):

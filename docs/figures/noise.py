@@ -1,12 +1,12 @@
-"""How noisy the cost advantage of a policy update is: of felt costs and of fear, by how seldom a cost is felt.
+"""How noisy the cost advantage of a policy update is: of observed costs and of fear, by how seldom a cost is observed.
 
     python -m docs.figures.noise    trains, measures and writes bench/results/advantage_noise.json (15 minutes)
     python -m docs.figures.noise --updates 60 --json bench/results/advantage_noise_later.json    (26 minutes)
 
 For each p and seed, F4SG trains for 30 updates on the CPU. Then the policy collects one batch. Its true costs are
-thinned 32 times: a costly step is felt with probability p. Each thinning has two cost advantages. Both come from the
-same GAE with the same values of the cost critic. MAPPO-Lagrangian's signal is the felt cost. F4SG's signal is fear: its
-network starts from the same weights and is fitted to the thinning as in an update, with a shuffle of its own.
+thinned 32 times: a costly step is observed with probability p. Each thinning has two cost advantages. Both come from
+the same GAE with the same values of the cost critic. MAPPO-Lagrangian's signal is the observed cost. F4SG's signal is
+fear: its network starts from the same weights and is fitted to the thinning as in an update, with a shuffle of its own.
 
 The main measures set the critic's values aside, with 0 in their place: the critic's error is the same for both signals
 and for the truth, so it counts as signal, and it dominates a batch with few costs. The measures with the critic's
@@ -38,7 +38,7 @@ from pmt_jax.learning.types import LearnerState, Tag
 
 STORED = records.RESULTS / "advantage_noise.json"
 TASK, SEEDS, UPDATES, THINNINGS = "ant_2x4", (100, 101, 102), 30, 32
-SHARES = (1.0, 0.3, 0.1, 0.03, 0.01)  # p, the probability that a costly step is felt
+SHARES = (1.0, 0.3, 0.1, 0.03, 0.01)  # p, the probability that a costly step is observed
 SIGNALS, VALUES = ("cost", "fear"), ("critic", "zero")
 THINNED = max(Tag) + 1  # the tag of the thinnings' draws
 
@@ -49,7 +49,7 @@ def advantages(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[jax.Arr
     The true cost is multiplied by p, so that it is the mean of the thinnings and fits the critic's unit.
 
     Returns:
-      true [2, T, B, N, K] and drawn [THINNINGS, 2, 2, T, B, N, K], in units of felt cost. The last axis of two is
+      true [2, T, B, N, K] and drawn [THINNINGS, 2, 2, T, B, N, K], in units of observed cost. The last axis of two is
       VALUES: the critic's values, or 0 in their place. The one before it is SIGNALS. Last, the true cost per step [].
     """
     key = jax.random.fold_in(state.key, state.update)
@@ -63,10 +63,10 @@ def advantages(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[jax.Arr
         return jnp.stack([gae(signal, value, following, *ends)[0] for value, following in (values, zeros)])
 
     def thinned(key: jax.Array) -> jax.Array:
-        felt = tasks.felt_cost(flatten_steps(batch.true_cost), key, hyper.cost_seen, 0.0).reshape(batch.cost.shape)
-        seen = dataclasses.replace(batch, cost=felt)
+        observed = tasks.observed_cost(flatten_steps(batch.true_cost), key, hyper.cost_seen).reshape(batch.cost.shape)
+        seen = dataclasses.replace(batch, cost=observed)
         _, feared, _ = fear.appraise_fear(setup, hyper, now, state.fear, seen, jax.random.fold_in(key, Tag.FEAR))
-        return jnp.stack([both(felt), both(feared)])
+        return jnp.stack([both(observed), both(feared)])
 
     drawn = jax.lax.map(thinned, jax.random.split(jax.random.fold_in(key, THINNED), THINNINGS))
     return both(hyper.cost_seen * batch.true_cost), drawn, batch.true_cost.mean()
@@ -77,7 +77,8 @@ def measures(drawn: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
     noise_share: variance across thinnings, mean over rows, over the variance across rows and thinnings. correlation: of
     one thinning with the truth, over rows, mean over thinnings; 0 if the thinning has no variance. slope: of the
-    thinnings' regression on the truth, 1 if unbiased. std: standard deviation across rows and thinnings, in felt cost.
+    thinnings' regression on the truth, 1 if unbiased. std: standard deviation across rows and thinnings, in observed
+    cost.
 
     Args:
       drawn: [THINNINGS, T, B, N, K]; true: [T, B, N, K].

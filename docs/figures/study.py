@@ -1,4 +1,4 @@
-"""Draws docs/study.png, true cost and reward at the end against how seldom harm is felt, and docs/study_curves.png,
+"""Draws docs/study.png, true cost and reward at the end against how seldom harm is observed, and docs/study_curves.png,
 the same over training at p = 0.03; from bench/results.
 
 python -m docs.figures.study
@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
-from bench.forms import runs, study
+from bench.tables import runs, study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 from pmt_jax.studies.statistics import mean_interval
 
@@ -23,7 +23,7 @@ from . import style
 DOCS = pathlib.Path(__file__).parents[1]
 PANELS = {"end": "true cost of an episode", "reward": "reward of an episode"}
 SHOWN = ("mappo_l", "f4sg", "r4sg", "mixed", "macpo")
-# Where a method's name stands beside its last mark in either panel: points to the right and up, and its alignment.
+# Where a method's name stands next to its last mark in either panel: points to the right and up, and its alignment.
 PLACES = {
     "end": {"r4sg": (-4, 10, "right"), "mixed": (-6, -11, "right"), "macpo": (-9, 0, "right")},
     "reward": {"r4sg": (-8, -12, "right"), "mixed": (-9, 0, "right"), "macpo": (-9, 6, "right")},
@@ -38,7 +38,7 @@ def draw(found: list[runs.Run], file: pathlib.Path) -> None:
             for method in SHOWN:
                 _line(axis, [run for run in found if run["method"] == method], name)
             axis.set_title(title, loc="left", fontsize=12, fontweight="bold")
-            axis.set(xscale="log", xlabel="probability that a costly step is felt")
+            axis.set(xscale="log", xlabel="probability that a costly step is observed")
             axis.set_xticks([0.01, 0.03, 0.1, 1], ["0.01", "0.03", "0.1", "1"])
             axis.set_xlim(1.25, 0.0045)
             if name == "end":
@@ -105,7 +105,7 @@ def draw_curves(found: list[runs.Run], file: pathlib.Path, seen: float = 0.03) -
                 axis.axhline(10, color=INK, lw=1.2, ls="--")
                 style.name_limit(axis, 10)
             style.label_lines(axis, ends)
-        seeds, share = len(cells[0]["seeds"]), f"a costly step is felt with probability {seen:g}"
+        seeds, share = len(cells[0]["seeds"]), f"a costly step is observed with probability {seen:g}"
         title = f"ant_2x4, {share}: mean of {seeds} seeds, band: standard deviation"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         figure.savefig(file, dpi=110)

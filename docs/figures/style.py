@@ -1,4 +1,4 @@
-"""What all figures of the documents share: names and colours of methods, and labels that stand beside their lines."""
+"""What all figures of the documents share: names and colours of methods, and labels that stand next to their lines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import EngFormatter
 
-from bench.forms import study
+from bench.tables import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
 NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}

@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
-from bench.forms import runs
+from bench.tables import runs
 from pmt_jax.studies.plot import INK, METHOD_COLOURS, cost_ticks
 
 from . import style

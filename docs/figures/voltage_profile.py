@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs.voltage.baselines import POLICIES, Policy
+from envs.voltage.baselines import CONTROLLERS, Controller
 from envs.voltage.control import VoltageControl
 from envs.voltage.profiles import ROWS_PER_DAY
 from pmt_jax.studies.plot import BLUE, RED
 
 
-def day_of_voltages(env: VoltageControl, policy: Policy, start_row: int) -> np.ndarray:
+def day_of_voltages(env: VoltageControl, policy: Controller, start_row: int) -> np.ndarray:
     """[480, n] p.u. over the day that begins at `start_row`."""
 
     def step(state, _):
@@ -77,7 +77,7 @@ def draw(env: VoltageControl, before: np.ndarray, after: np.ndarray, policy: str
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="voltage_33", choices=("voltage_33", "voltage_141"))
-    parser.add_argument("--policy", default="opf", choices=tuple(POLICIES))
+    parser.add_argument("--policy", default="opf", choices=tuple(CONTROLLERS))
     parser.add_argument("--data", default="simbench")
     parser.add_argument("--day", type=int, default=142, help="of the data; in the packaged year a sunny one in May")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "voltage_profile.png")
@@ -85,7 +85,7 @@ def main() -> None:
     env = envs.make(args.task, data=args.data, noise=False)
     assert isinstance(env, VoltageControl)
     row = args.day * ROWS_PER_DAY
-    before, after = (day_of_voltages(env, POLICIES[name](env), row) for name in ("zero", args.policy))
+    before, after = (day_of_voltages(env, CONTROLLERS[name](env), row) for name in ("zero", args.policy))
     draw(env, before, after, "optimal dispatch" if args.policy == "opf" else args.policy, args.out)
 
 

@@ -144,6 +144,7 @@ class AntCorridor:
             actions=tuple(tuple(names[motor] for motor in group) for group in self._partition.groups),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
+            kernels=getattr(self._engine, "kernels", tuple),
         )
         self.spec = EnvSpec(
             name=f"ant_{self._partition.name}",
@@ -312,7 +313,7 @@ def off_centre(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _relative(place: jax.Array, phase: jax.Array | None) -> jax.Array:
-    """A place [>= 2] m beside a corridor that sways, as the same place beside one that does not."""
+    """A place [>= 2] m next to a corridor that sways, as the same place next to one that does not."""
     return place if phase is None else place.at[1].add(-SWAY_REACH * jnp.sin(phase))
 
 

@@ -215,6 +215,7 @@ class HandOver:
             actions=_motors(self.model, mask),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
+            kernels=getattr(self._engine, "kernels", tuple),
         )
         self.spec = EnvSpec(
             name=f"hand_over_{variant}",

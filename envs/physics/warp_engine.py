@@ -42,7 +42,6 @@ class WarpEngine:
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
         self._call: Any = None
         self._stepping = threading.Lock()  # devices may call at once, and the CPU's share their data
-        warp_kernels.engines.add(self)
 
     def start(self) -> PhysicsState:
         return rest_state(self._c_model)
@@ -77,12 +76,12 @@ class WarpEngine:
         """Warp's data for a batch on the devices that may step it; none can be made while a graph is captured."""
         import warp
 
-        places = warp_kernels.places()
-        for place in places:
-            if (place.alias, batch) not in self._held:
-                with warp.ScopedDevice(place):
-                    self._held[place.alias, batch] = self.worlds(batch)
-        return self._held[places[0].alias, batch][1]
+        devices = warp_kernels.devices()
+        for device in devices:
+            if (device.alias, batch) not in self._held:
+                with warp.ScopedDevice(device):
+                    self._held[device.alias, batch] = self.worlds(batch)
+        return self._held[devices[0].alias, batch][1]
 
     def worlds(self, batch: int) -> tuple[Any, Any]:
         """Warp's model, and its data for so many worlds, on Warp's current device."""
@@ -120,8 +119,12 @@ class WarpEngine:
             for name, array in zip(self._fields(), outputs, strict=True):
                 warp.copy(array, getattr(data, name))
 
-    def rehearse(self) -> None:
-        """The launches of `step` for one world, without XLA; no batch changes them. See `warp_kernels`."""
+    def kernels(self) -> list[Callable[[], Any]]:
+        """What `step` launches; each entry compiles a part and loads it, on any thread."""
+        return warp_kernels.of_launches(self._step_one)
+
+    def _step_one(self) -> None:
+        """Launches what `step` does, for one world and without XLA; no batch changes the kernels."""
         from mujoco.mjx.third_party import mujoco_warp
 
         model, data = self.worlds(1)
@@ -150,7 +153,7 @@ def _foreign(function: Callable[..., None], inputs: Sequence[str], outputs: Mapp
     parameters = [inspect.Parameter(name, kind, annotation=array) for name, array in kinds.items()]
     call.__signature__, call.__annotations__ = inspect.Signature(parameters), kinds
     # Warp captures the graph: XLA's own captures take no loops, which the solver has.
-    mode = warp.JaxCallableGraphMode.WARP if warp_kernels.places()[0].is_cuda else warp.JaxCallableGraphMode.NONE
+    mode = warp.JaxCallableGraphMode.WARP if warp_kernels.devices()[0].is_cuda else warp.JaxCallableGraphMode.NONE
     return warp.jax_callable(call, num_outputs=len(outputs), graph_mode=mode)
 
 

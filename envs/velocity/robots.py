@@ -1,7 +1,7 @@
 """The robots of the velocity tasks: data, but for the rules of health.
 
-The models are Gymnasium's (LICENSE beside them); every file says what was changed so that MuJoCo 3.17 computes what the
-reference's MuJoCo 2.3.3 does.
+The models are Gymnasium's (LICENSE next to them); every file says what was changed so that MuJoCo 3.17 computes what
+the reference's MuJoCo 2.3.3 does.
 """
 
 # mujoco is a binary module without stubs:

@@ -126,6 +126,7 @@ class Velocity:
             actions=tuple(tuple(names[motor] for motor in agent) for agent in partition),
             picture=Scene(self._drawn, self.model, self.decorate),
             overflow="physics_overflow",
+            kernels=getattr(self._engine, "kernels", tuple),
         )
         self.spec = EnvSpec(
             name=f"velocity_{variant}",

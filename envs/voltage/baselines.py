@@ -15,16 +15,14 @@ Examples:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from ..base import Policy, State
-
-if TYPE_CHECKING:
-    from .control import VoltageControl
+from ..base import Controller, EnvSpec, State
+from .power_flow import PowerFlow
 
 # IEEE 1547-2018, category B: 44 % of the rating over 6 % of voltage. The standard's default curve has a dead band of
 # 2 % around nominal voltage, the baseline that is quoted for this benchmark has none.
@@ -32,12 +30,30 @@ DROOP_SLOPE = 0.44 / 0.06
 DROOP_RESPONSE = 0.5  # share of the way to the curve in one control step; all of it would oscillate
 
 
-def zero(env: VoltageControl) -> Policy:
+class Grid(Protocol):
+    """What a baseline reads of an environment of `envs.voltage.control`, see there."""
+
+    spec: EnvSpec
+    scenario: Any
+    s_max: jax.Array
+    v_lower: float
+    v_upper: float
+
+    def q_limit(self, row: jax.Array) -> jax.Array:
+        """[n_pv] MVAr."""
+        ...
+
+    def flow(self, state: State, action: jax.Array) -> PowerFlow:
+        """What the next step's row gives under `action`."""
+        ...
+
+
+def zero(env: Grid) -> Controller:
     """No reactive power."""
     return lambda state: jnp.zeros((env.spec.num_agents, 1), state.obs.dtype)
 
 
-def random(env: VoltageControl) -> Policy:
+def random(env: Grid) -> Controller:
     """Uniform in [-1, 1], drawn from the state's own key."""
 
     def policy(state: State) -> jax.Array:
@@ -48,12 +64,12 @@ def random(env: VoltageControl) -> Policy:
 
 
 def droop(
-    env: VoltageControl,
+    env: Grid,
     slope: float = DROOP_SLOPE,
     dead_band: float = 0.0,
     largest_share: float = 1.0,
     response: float = DROOP_RESPONSE,
-) -> Policy:
+) -> Controller:
     """Volt-var droop on each inverter's own voltage, followed with a first-order lag.
 
     Args:
@@ -74,7 +90,7 @@ def droop(
     return policy
 
 
-def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: float = 20.0) -> Policy:
+def opf(env: Grid, iterations: int = 60, margin: float = 5e-4, price: float = 20.0) -> Controller:
     """Least line losses with voltages in the band, knowing the row to come and every bus: a bound, not a controller.
 
     Adam on the actions through the differentiable power flow. Leaving the band costs `price` MW per p.u. and bus, from
@@ -103,10 +119,15 @@ def opf(env: VoltageControl, iterations: int = 60, margin: float = 5e-4, price: 
     return policy
 
 
-POLICIES: dict[str, Callable[[VoltageControl], Policy]] = {"zero": zero, "random": random, "droop": droop, "opf": opf}
+CONTROLLERS: dict[str, Callable[[Grid], Controller]] = {
+    "zero": zero,
+    "random": random,
+    "droop": droop,
+    "opf": opf,
+}
 
 
-def q_to_action(env: VoltageControl, state: State, q: jax.Array) -> jax.Array:
+def q_to_action(env: Grid, state: State, q: jax.Array) -> jax.Array:
     """[N, 1] the action that sets reactive powers `q` [N] MVAr in the next step; beyond [-1, 1] if it cannot."""
     limit = env.scenario.action_scale * env.q_limit(state.carry.row)
     return (q / jnp.maximum(limit, 1e-9))[:, None]

@@ -33,7 +33,7 @@ from ..base import Declarations, EnvSpec, NetworkMap, State
 from ..blocks import Block, Blocks, length
 from ..errors import TaskError, at_least, one_of, typed
 from . import power_flow
-from .baselines import POLICIES
+from .baselines import CONTROLLERS
 from .layout import layout
 from .power_flow import Network, PowerFlow
 from .profiles import ROWS_PER_DAY, Profiles, load_profiles
@@ -248,7 +248,7 @@ class VoltageControl:
             picture=NetworkMap(
                 self.raw, "vm_pu", band, x, y, links, agents=np.asarray(self.scenario.table["pv_bus"]), unit="p.u."
             ),
-            baselines={name: functools.partial(make, self) for name, make in POLICIES.items()},
+            baselines={name: functools.partial(make, self) for name, make in CONTROLLERS.items()},
         )
 
     def reset(self, key: jax.Array) -> State:
@@ -357,7 +357,7 @@ class VoltageControl:
     # Physics
 
     def q_limit(self, row: jax.Array) -> jax.Array:
-        """[n_pv] MVAr that the inverters' ratings leave beside the active power."""
+        """[n_pv] MVAr that the inverters' ratings leave next to the active power."""
         pv = row[: self.num_agents]
         return jnp.sqrt(jnp.maximum(self.s_max**2 - pv**2, 0))
 

@@ -513,8 +513,6 @@ def branch_network(
       TaskError: a bus that no branch reaches, a branch without impedance, an index out of range, a number that is not
         finite or has a sign that it cannot have, or branches that cancel.
     """
-    z: Any
-    half: Any
     f, t, z, half, ratio = _branch_arrays(n_bus, branches, name)
     shunts = np.zeros(n_bus, complex) if shunt is None else np.asarray(shunt, complex)
     _check_numbers(n_bus, branches, base_mva, (slack, slack_vm, slack_va), shunts, name)
@@ -522,10 +520,7 @@ def branch_network(
     _check_connected(n_bus, f, t, slack, name)
     where = np.setdiff1d(np.arange(n_bus), [slack]) if inject is None else _injection_buses(inject, n_bus, slack)
     slack_v = slack_vm * np.exp(1j * slack_va)
-    try:
-        z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v)
-    except np.linalg.LinAlgError:
-        raise TaskError(f"network '{name}': its admittances cancel, so voltages do not follow from currents") from None
+    z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v, name)
     series = to_series @ z_all[:, where]
     series_0 = to_series @ v_0
     feed, feed_0 = y_bus[slack] @ z_all[:, where], y_bus[slack] @ v_0
@@ -555,11 +550,14 @@ def branch_network(
     )
 
 
-def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex) -> tuple[np.ndarray, np.ndarray]:
+def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex, name: str) -> tuple[np.ndarray, np.ndarray]:
     """z [n, n] and v_0 [n], p.u., with V = z I + v_0; the slack's row and column of z are 0: no current moves it."""
     others = np.setdiff1d(np.arange(len(y_bus)), [slack])
     z_all = np.zeros(y_bus.shape, complex)
-    z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
+    try:
+        z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
+    except np.linalg.LinAlgError:
+        raise TaskError(f"network '{name}': its admittances cancel, so voltages do not follow from currents") from None
     v_0 = -z_all @ y_bus[:, slack] * slack_v
     v_0[slack] = slack_v
     return z_all, v_0
@@ -592,7 +590,7 @@ def _check_numbers(
             raise TaskError(f"network '{name}': branch {i} is a line of negative resistance, r = {branch.r}")
 
 
-def _branch_arrays(n_bus: int, branches: Sequence[Branch], name: str) -> tuple[np.ndarray, ...]:
+def _branch_arrays(n_bus: int, branches: Sequence[Branch], name: str) -> tuple[Any, ...]:
     """from-bus, to-bus, series impedance, half the shunt admittance and complex ratio of each branch."""
     f, t = (np.array([branch[i] for branch in branches], int) for i in (0, 1))
     if f.size == 0 or min(f.min(), t.min()) < 0 or max(f.max(), t.max()) >= n_bus:

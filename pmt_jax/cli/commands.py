@@ -17,7 +17,7 @@ from ..tasks import did_you_mean
 from ..tasks import names as task_names
 from . import doctor, pictures, policies, studies, tasks, train
 from .parser import HELP, Parser, command, refuse_unknown
-from .process import answer, at_once
+from .process import answer, interruptible
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -46,7 +46,7 @@ def make_parser() -> tuple[Parser, dict[str, Parser]]:
     return parser, dict(commands.choices)
 
 
-@at_once()
+@interruptible()
 def run_completion(arguments: argparse.Namespace) -> int:
     """Prints a shell's completion script."""
     if arguments.shell not in SHELLS:

@@ -17,7 +17,7 @@ from ..output import result
 from ..probe import run_python
 from ..render import gl
 from .parser import command
-from .process import at_once, system_obstacle
+from .process import interruptible, system_obstacle
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 EXTRAS = {  # which of our extras brings an optional package
@@ -59,7 +59,7 @@ def add(commands: Any) -> None:
     command(commands, "doctor", run, "check versions, devices, engines and packages of this machine")
 
 
-@at_once()
+@interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Prints all findings."""
     del arguments
@@ -88,7 +88,7 @@ def examine() -> Iterator[Finding]:
         yield Finding("bad", "operating system", obstacle)
     if found["jax"] and found["jaxlib"]:
         yield from _computing()
-    yield from _rendering()
+    yield from check_rendering()
     for name, extra in EXTRAS.items():
         version = tasks.installed_version(name)
         absent = Finding("no", name, f"not installed; optional: pip install 'pmt-jax[{extra}]'")
@@ -103,8 +103,8 @@ def _computing() -> Iterator[Finding]:
         yield Finding("bad", "settings of JAX", str(error).splitlines()[0])
         return
     yield _devices()
-    yield from _engines()
-    yield _cache()
+    yield from check_engines()
+    yield check_cache()
 
 
 def _devices() -> Finding:
@@ -119,7 +119,8 @@ def _devices() -> Finding:
     return Finding("ok", "devices", f"{kinds}; {usable_cpus()} CPUs usable")
 
 
-def _engines() -> Iterator[Finding]:
+def check_engines() -> Iterator[Finding]:
+    """Whether each physics engine can be used here, and which one `auto` takes."""
     try:
         chosen, obstacles = tasks.engines()
     except (UsageError, ImportError, RuntimeError) as error:
@@ -135,7 +136,7 @@ def _engines() -> Iterator[Finding]:
         yield Finding("no", f"engine {name}", obstacle) if obstacle else Finding("ok", f"engine {name}", usable)
 
 
-def _cache() -> Finding:
+def check_cache() -> Finding:
     """What the persistent compile cache holds, and whether one process finds what another has put into one."""
     from ..training.compile import cache_folder
 
@@ -152,7 +153,7 @@ def _cache() -> Finding:
     return Finding("ok", "compile cache", f"{holds}; a second process hits what a first has compiled")
 
 
-def _rendering() -> Iterator[Finding]:
+def check_rendering() -> Iterator[Finding]:
     """Tries each of MuJoCo's ways to draw."""
     for backend in gl.backends():
         error = gl.obstacle(backend)

@@ -8,13 +8,13 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
+from ..config.fields import INT32_MAX
 from ..errors import UsageError
 from ..output import result
 from ..tasks import did_you_mean
 
 RUN = "a run folder, or a pretrained policy: hub:ant_2x4/r4sg (pmt hub lists them)"
 SOURCE = "a task's name (pmt envs lists them), a TOML file, or a Python file with a task of your own: my_env.py"
-INT32_MAX = 2**31 - 1
 HELP = ("-h", "--help")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from .. import numerics
 from ..output import say
 from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, span, whole
-from .process import at_once
+from .process import interruptible
 
 
 def add(commands: Any) -> None:
@@ -67,7 +67,7 @@ def add(commands: Any) -> None:
 
 def run_render(arguments: argparse.Namespace) -> int:
     """Writes an episode as a film or a page."""
-    with at_once():
+    with interruptible():
         numerics.check()
         from ..render import film
         from ..trust import trusting
@@ -89,7 +89,7 @@ def run_render(arguments: argparse.Namespace) -> int:
 
 def run_plot(arguments: argparse.Namespace) -> int:
     """Draws training curves."""
-    with at_once():
+    with interruptible():
         from ..studies import plot
 
     plot.plot(arguments.run_folders, arguments.out)
@@ -99,7 +99,7 @@ def run_plot(arguments: argparse.Namespace) -> int:
 
 def run_report(arguments: argparse.Namespace) -> int:
     """Writes everything about runs on one page."""
-    with at_once():
+    with interruptible():
         numerics.check()
         from ..policies.load import check_trusted
         from ..render import report

@@ -13,7 +13,7 @@ from ..errors import UsageError
 from ..files import to_stderr
 from ..output import result, say
 from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, whole
-from .process import at_once
+from .process import interruptible
 
 
 def add(commands: Any) -> None:
@@ -58,7 +58,7 @@ def add(commands: Any) -> None:
     command(commands, "hub", run_hub, "list the pretrained policies with their evaluations")
 
 
-@at_once()
+@interruptible()
 def run_eval(arguments: argparse.Namespace) -> int:
     """Prints what a run's policies, or a baseline, reach."""
     for flag in ("which", "physics") if arguments.policy else ("env",):
@@ -86,13 +86,13 @@ def run_eval(arguments: argparse.Namespace) -> int:
     count = f"{episodes} episode{'s' * (episodes > 1)}"
     result(f"{arguments.source}: {count} a seed, {how}; {shown}")
     for row in rows:
-        _say_row(row)
+        say_row(row)
     if arguments.save:
         result(f"wrote every step to {arguments.save}")
     return 0
 
 
-def _say_row(row: dict[str, Any]) -> None:
+def say_row(row: dict[str, Any]) -> None:
     """One seed's metrics, a line each."""
     from ..limits import Limits
 
@@ -108,7 +108,7 @@ def _say_row(row: dict[str, Any]) -> None:
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes a policy as files."""
-    with at_once():
+    with interruptible():
         numerics.check()
         from ..policies.export import export_policy
         from ..trust import trusting
@@ -119,7 +119,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-@at_once()
+@interruptible()
 def run_hub(arguments: argparse.Namespace) -> int:
     """Lists the pretrained policies."""
     del arguments

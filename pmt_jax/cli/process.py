@@ -88,7 +88,7 @@ def _print(name: str, sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def at_once() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """Ctrl-C ends the process at once, for commands or moments that leave nothing half written.
 
     As an exception it would be lost in JAX's callbacks, wait for the compiler, or leave half a module imported. XLA's
@@ -127,7 +127,7 @@ def check_system() -> None:
 
 def refuse_many(command: str, jobs: int, devices: int | None) -> None:
     """Refuses to run once in each of several processes, which would write into the same folders."""
-    from ..studies.workers import share_memory
+    from ..studies.jobs import share_memory
     from ..training import processes
 
     processes.make_room(devices)

@@ -11,7 +11,7 @@ from ..output import check_written, result, say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
 from .parser import SOURCE, add_format, add_jobs, add_trust, command, whole
-from .process import at_once, refuse_many
+from .process import interruptible, refuse_many
 
 
 def add(commands: Any) -> None:
@@ -110,7 +110,7 @@ def _add_reproduce(commands: Any) -> None:
     add_format(reproduce)
 
 
-@at_once()
+@interruptible()
 def run_sweep(arguments: argparse.Namespace) -> int:
     """Trains all combinations of some settings' values."""
     from ..studies.points import from_file, from_words, has_parts, make_points
@@ -141,7 +141,7 @@ def _launch(arguments: argparse.Namespace) -> Any:
     return sweep.Launch(not arguments.no_cache, say, arguments.devices, arguments.jobs)
 
 
-@at_once()
+@interruptible()
 def run_table(arguments: argparse.Namespace) -> int:
     """Prints or writes runs as a table."""
     from ..files import writing
@@ -159,18 +159,18 @@ def run_table(arguments: argparse.Namespace) -> int:
     return 0
 
 
-@at_once()
+@interruptible()
 def run_compare(arguments: argparse.Namespace) -> int:
     """Prints how two runs differ."""
-    from ..studies import pair
+    from ..studies import compare
 
-    result(pair.compare(arguments.first, arguments.second, arguments.out).removesuffix("\n"))
+    result(compare.compare(arguments.first, arguments.second, arguments.out).removesuffix("\n"))
     if arguments.out:
         say(f"wrote {arguments.out}")
     return 0
 
 
-@at_once()
+@interruptible()
 def run_reproduce(arguments: argparse.Namespace) -> int:
     """Trains what is missing of one of the paper's tables and prints it."""
     refuse_many("pmt reproduce", arguments.jobs, arguments.devices)

@@ -11,7 +11,7 @@ from ..config.load import load_config
 from ..output import result
 from ..trust import check_source
 from .parser import command
-from .process import at_once
+from .process import interruptible
 
 
 def add(commands: Any) -> None:
@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
     parser.add_argument("task", nargs="?", metavar="TASK", help="a task's name, or a Python file of your own")
 
 
-@at_once()
+@interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Lists the tasks, which needs no JAX, or describes one, which builds it."""
     if arguments.task is not None:

@@ -15,7 +15,7 @@ from ..output import say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
 from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
-from .process import at_once, check_system
+from .process import check_system, interruptible
 
 
 def add(commands: Any) -> None:
@@ -37,7 +37,7 @@ def add(commands: Any) -> None:
         "--change", action="store_true", help="with --resume: continue with settings other than those of the run"
     )
     output.add_argument(
-        "--sink",
+        "--loggers",
         type=names,
         default=[],
         metavar="NAMES",
@@ -53,49 +53,49 @@ def add(commands: Any) -> None:
     hosts = parser.add_argument_group("devices and processes", "under SLURM's srun, processes need no flag")
     add_devices(hosts)
     hosts.add_argument(
-        "--jobs", type=whole(1), default=1, metavar="N", help="worker processes that share seeds and CPUs (default 1)"
+        "--workers",
+        type=whole(1),
+        default=1,
+        metavar="N",
+        help="processes that share seeds and CPUs (default 1)",
     )
     hosts.add_argument("--coordinator", metavar="HOST:PORT", help="where the first process listens")
     hosts.add_argument("--process", type=whole(0), metavar="I", help="which process this is, from 0")
     hosts.add_argument("--processes", type=whole(1), metavar="N", help="how many there are")
 
 
-@at_once()
+@interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
     with trusting(arguments.trust):
-        return _train(arguments)
+        config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
+        if arguments.resume and arguments.out is None:
+            raise UsageError("--resume needs --out, the folder of the run to continue")
+        if arguments.change and not arguments.resume:
+            raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
+        check_source(arguments.source, [config.task])
+        if arguments.verbose:
+            logging.getLogger("envs").setLevel(logging.INFO)
+        if sys.stdout.isatty():
+            say("loading JAX and the task ...")  # ten seconds with Warp
+        check_system()
+        numerics.check_settings()
+        from ..policies import warm_start
+        from ..training import processes, trainer
 
-
-def _train(arguments: argparse.Namespace) -> int:
-    config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
-    if arguments.resume and arguments.out is None:
-        raise UsageError("--resume needs --out, the folder of the run to continue")
-    if arguments.change and not arguments.resume:
-        raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
-    check_source(arguments.source, [config.task])
-    if arguments.verbose:
-        logging.getLogger("envs").setLevel(logging.INFO)
-    if sys.stdout.isatty():
-        say("loading JAX and the task ...")  # ten seconds with Warp
-    check_system()
-    numerics.check_settings()
-    from ..policies import warm_start
-    from ..training import processes, trainer
-
-    processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
-    numerics.check_devices()
-    return trainer.train(
-        config,
-        arguments.out,
-        arguments.resume,
-        cache=not arguments.no_cache,
-        loggers=arguments.sink,
-        profile=arguments.profile,
-        say=say,
-        count=arguments.devices,
-        workers=arguments.jobs,
-        warm_start=warm_start.prepare,
-        debug=arguments.debug,
-        change=arguments.change,
-    )
+        processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
+        numerics.check_devices()
+        return trainer.train(
+            config,
+            arguments.out,
+            arguments.resume,
+            cache=not arguments.no_cache,
+            loggers=arguments.loggers,
+            profile=arguments.profile,
+            say=say,
+            devices=arguments.devices,
+            workers=arguments.workers,
+            warm_start=warm_start.prepare,
+            debug=arguments.debug,
+            change=arguments.change,
+        )

@@ -66,7 +66,7 @@ class Hyper:
     std_half_life: float = learning(
         math.inf,
         "environment steps of a seed in which the noise of actions, their standard deviation, halves after "
-        "std_decay_start, beside what the policies learn of it; inf leaves it to them",
+        "std_decay_start, on top of what the policies learn of it; inf leaves it to them",
         STEPS_OR_INF,
     )
     std_decay_start: float = learning(
@@ -121,11 +121,6 @@ class Hyper:
         1.0,
         "probability that the learner notices the cost of a costly step; it scales the task's own limit, too",
         Bound("be a probability above 0", lambda x: 0 < x <= 1),
-    )
-    cost_false: float = constraint(
-        0.0,
-        "probability that the learner takes a safe step for a costly one",
-        Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
     )
     lambda_init: float = constraint(0.78, "multiplier before the first update", NOT_NEGATIVE)
     lambda_lr: float = constraint(
@@ -342,11 +337,9 @@ def _validate(config: Config) -> None:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
     if config.lambda_unit == "relative" and not config.lambda_init:
         raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
-    if config.cost_seen <= config.cost_false:
-        raise UsageError(
-            f"cost_seen = {config.cost_seen} must lie above cost_false = {config.cost_false}, or a costly step is felt "
-            "no more often than a safe one"
-        )
+    for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
+        if option in dict(config.env):
+            raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
     if config.cost_estimate == "critic" and config.gamma == 1:
         raise UsageError(
             "cost_estimate = critic takes (1 - gamma) times the value for the cost of a step, which is 0; set gamma "

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from ..limits import columns
 from .rollout import finished_mean
 from .schedules import Schedule
-from .setup import Setup, held_limit
-from .types import Batch, Constraint, Hyper, Metrics, PolicyRows
+from .setup import Setup, limit_less_margin
+from .types import Batch, Constraint, Hyper, Metrics, PolicySamples
 
 LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
 
@@ -34,7 +34,7 @@ def init(setup: Setup, hyper: Hyper) -> Constraint:
 
 def target(hyper: Hyper) -> jax.Array:
     """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
-    return held_limit(hyper, hyper.cost_margin)
+    return limit_less_margin(hyper, hyper.cost_margin)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -91,7 +91,7 @@ def excess_in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.
     if setup.config.lambda_unit == "step":
         return excess
     # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
-    limit = target(hyper) if setup.config.lambda_unit == "relative" else held_limit(hyper, 0.0)
+    limit = target(hyper) if setup.config.lambda_unit == "relative" else limit_less_margin(hyper, 0.0)
     return relative_excess(excess, limit, setup.vector.horizon)
 
 
@@ -137,7 +137,7 @@ def respond(
     hyper: Hyper,
     now: Schedule,
     constraint: Constraint,
-    rows: PolicyRows,
+    samples: PolicySamples,
     excess: jax.Array,
     log_ratio: jax.Array,
     reach: jax.Array,
@@ -145,7 +145,7 @@ def respond(
     """One agent's constraint [K] after its policy has changed.
 
     Args:
-      rows: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
+      samples: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
       reach: [] cost per step, the most that a step of the trust region promised to take off the cost.
     """
     if setup.method.constraint == "none":
@@ -153,7 +153,7 @@ def respond(
     if setup.method.constraint == "trust_region":
         lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, now.limit_windup * reach)
         return dataclasses.replace(constraint, lowered=lowered)
-    surrogate = surrogate_cost(log_ratio, rows.log_weight, rows.cost_advantage)
+    surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
     step = excess_in_lambda_unit(setup, hyper, excess + hyper.surrogate_weight * surrogate)
     if setup.config.lambda_unit == "relative":
         lowest = LAMBDA_MIN * hyper.lambda_init

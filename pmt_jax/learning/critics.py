@@ -32,16 +32,16 @@ def fit_critic(
     critic: Critic,
     value_fn: ValueFn,
     clip: jax.Array | float,
-    rows: tuple[jax.Array, jax.Array, jax.Array],
+    samples: tuple[jax.Array, jax.Array, jax.Array],
     key: jax.Array,
 ) -> tuple[Critic, Metrics]:
     """Updates the moments of the returns once, then fits the critic to them in the new units.
 
     Args:
       clip: half-width of the interval of values, in those units.
-      rows: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+      samples: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
     """
-    state, old_value, returns = rows
+    state, old_value, returns = samples
     moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
     normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 

@@ -14,7 +14,7 @@ import scipy.special
 
 from .. import limits, tasks
 from . import sharding
-from .rollout import Feel, cost_beyond
+from .rollout import ObserveCost, cost_beyond
 from .setup import Setup
 from .types import ActingState, Hyper, Metrics, Tag
 
@@ -44,14 +44,14 @@ def evaluate(
       episodes: environments, one episode each.
       deterministic: take the mean action instead of a sample.
       fresh: from starts, and with noise, other than those that training and `publish` choose by.
-      hyper: says what of the costs is felt; the setup's own if None.
+      hyper: says which costs are observed; the setup's own if None.
       record: also return every step, as in `play`.
 
     Returns:
       The metrics of `play`, and within_limit [episodes]: whether each cost of each agent (the true one, of several each
-      felt one) is within its limit.
+      observed one) is within its limit.
     """
-    felt = setup.hyper if hyper is None else hyper
+    hyper = setup.hyper if hyper is None else hyper
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
 
     def act(env: tasks.State, t: jax.Array) -> jax.Array:
@@ -59,12 +59,12 @@ def evaluate(
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         return mean + std * noise
 
-    def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
-        step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.FELT), t)
-        return tasks.felt_cost(cost, step_key, felt.cost_seen, felt.cost_false)
+    def observe(cost: jax.Array, t: jax.Array) -> jax.Array:
+        step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.OBSERVED_COST), t)
+        return tasks.observed_cost(cost, step_key, hyper.cost_seen)
 
-    metrics, costs = _play(setup.vector.env, act, episodes, feel, fresh, record)
-    beyond = cost_beyond(*costs, felt, setup.vector.horizon)
+    metrics, costs = _play(setup.vector.env, act, episodes, observe, fresh, record)
+    beyond = cost_beyond(*costs, hyper)
     return metrics | {"within_limit": jnp.all(beyond == 0, axis=(-2, -1)).astype(beyond.dtype)}
 
 
@@ -72,33 +72,33 @@ def play(
     env: tasks.Env,
     act: Act,
     episodes: int,
-    feel: Feel = lambda cost, t: cost,
+    observe: ObserveCost = lambda cost, t: cost,
     fresh: bool = False,
     record: bool = False,
 ) -> Metrics:
     """`episodes` whole episodes of any policy, from starts that are always the same.
 
     Args:
-      feel: what of a step's cost the team notices; all of it by default.
+      observe: what of a step's cost the learner observes; all of it by default.
       fresh: as in `evaluate`.
       record: also return every step.
 
     Returns:
       episode_reward, episode_cost (one agent's, mean over agents, summed over K), episode_length, violation_rate (share
       of the episode's steps with a cost above 0 for some agent), true_episode_cost and true_violation_rate (the same of
-      what the costs were before `feel`), non_finite and cost_out_of_range (steps of the episode that were not finite,
-      or had a cost outside [0, 1]), each agent's and cost's episode_cost/... and true_episode_cost/... (see
+      what the costs were before `observe`), non_finite and cost_out_of_range (steps of the episode that were not
+      finite, or had a cost outside [0, 1]), each agent's and cost's episode_cost/... and true_episode_cost/... (see
       `limits.columns`), and the task's info (means over the episode), each [episodes]; all undiscounted. With `record`
-      also `step/NAME` [horizon, episodes, ...]: obs (before the action), action, reward, cost as felt, true_cost,
+      also `step/NAME` [horizon, episodes, ...]: obs (before the action), action, reward, cost as observed, true_cost,
       terminated, truncated, info/NAME; 0 after an episode's end.
     """
-    return _play(env, act, episodes, feel, fresh, record)[0]
+    return _play(env, act, episodes, observe, fresh, record)[0]
 
 
 def _play(
-    env: tasks.Env, act: Act, episodes: int, feel: Feel, fresh: bool, record: bool
+    env: tasks.Env, act: Act, episodes: int, observe: ObserveCost, fresh: bool, record: bool
 ) -> tuple[Metrics, tuple[jax.Array, jax.Array]]:
-    """What `play` returns, and the episodes' costs [episodes, N, K], as felt and as they were."""
+    """What `play` returns, and the episodes' costs [episodes, N, K], as observed and as they were."""
     vector, spec = tasks.VectorEnv(env, episodes), env.spec
     mask = jnp.asarray(spec.action_mask)
     step_per_device = sharding.per_device(vector.step)
@@ -109,7 +109,7 @@ def _play(
         state, alive, sums = carry
         seen, action = state.env.obs, act(state.env, t) * mask
         state, outcome = step_per_device(state, action)
-        each = feel(outcome.cost, t)
+        each = observe(outcome.cost, t)
         now = {
             "episode_reward": outcome.reward,
             "episode_cost": each,
@@ -135,14 +135,14 @@ def _play(
     sums |= {name: jnp.zeros((episodes, spec.num_agents, spec.num_costs), start.env.reward.dtype) for name in costs}
     carry = (start, jnp.ones(episodes, bool), sums)
     (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
-    felt, true = (sums.pop(name) for name in costs)
+    observed, true = (sums.pop(name) for name in costs)
     per_step = [name for name in sums if not name.startswith("episode_") and name not in COUNTS]
     found = {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}
     shared = tasks.shares_cost(env)
-    for name, cost in zip(costs, (felt, true), strict=True):
+    for name, cost in zip(costs, (observed, true), strict=True):
         found[name] = cost.sum(-1).mean(-1)
         found |= limits.worst(name, cost, shared) | limits.columns(name, cost, shared)
-    return found, (felt, true)
+    return found, (observed, true)
 
 
 def _masked(x: jax.Array, alive: jax.Array) -> jax.Array:
@@ -151,14 +151,14 @@ def _masked(x: jax.Array, alive: jax.Array) -> jax.Array:
 
 
 def _recorded(
-    obs: jax.Array, action: jax.Array, felt: jax.Array, outcome: tasks.Outcome, alive: jax.Array
+    obs: jax.Array, action: jax.Array, observed: jax.Array, outcome: tasks.Outcome, alive: jax.Array
 ) -> dict[str, jax.Array]:
     """What `play` keeps of one step of all environments, 0 where an episode has ended."""
     kept = {
         "obs": obs,
         "action": action,
         "reward": outcome.reward,
-        "cost": felt,
+        "cost": observed,
         "true_cost": outcome.cost,
         "terminated": outcome.terminated,
         "truncated": outcome.truncated,

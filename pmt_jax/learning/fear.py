@@ -32,20 +32,20 @@ def appraise_fear(
         signal = setup.method.cost_signal
         return None, signal(batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
-    net = dataclasses.replace(net, params=setup.nets.awaken_fear(net.params, batch.cost.mean((0, 1))))
+    net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, batch.cost.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
-    rows = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
-    noise = jax.random.logistic(jax.random.fold_in(key, 2), rows[1].shape)
+    samples = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
+    noise = jax.random.logistic(jax.random.fold_in(key, 2), samples[1].shape)
 
-    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
-        state, cost, old, noise = rows
+    def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, cost, old, noise = samples
         logits = setup.nets.fear(params, state)
         distance = divergence(logits, cost, setup.config.fear_loss, noise, hyper.temperature)
         return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
 
     passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.fear_lr, "max_grad_norm": hyper.max_grad_norm}
-    net, metrics = fit(net, loss, (*rows, noise), key, **limits, **passes)
+    net, metrics = fit(net, loss, (*samples, noise), key, **limits, **passes)
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     return net, fear, {**metrics, **calibration(remembered, batch.cost)}
 

@@ -17,7 +17,7 @@ from .debug import check_finite, watched
 from .maths import running_moments
 from .maths.advantages import gae
 from .optimise import init_train_state
-from .policies import policy_rows, update_policies
+from .policies import Team, policy_samples, update_policies
 from .setup import Setup, make_setup
 from .types import Batch, Critic, LearnerState, Metrics, Tag
 
@@ -117,7 +117,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.side_by_side(
+    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
         partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
         partial(regret.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
     )
@@ -137,17 +137,17 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     )
     excess = constraint.cost_excess(estimate, constraint.target(hyper), horizon)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=held.estimate)
-    actor_rows = policy_rows(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
+    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
-    rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    samples, cost_samples = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
-    held = dataclasses.replace(held, estimate=estimate)
-    fitted = sharding.side_by_side(
-        partial(fit_critic, state.critic, setup.nets.value, hyper.clip, rows, tagged[Tag.CRITIC]),
-        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_rows, tagged[Tag.COST_CRITIC]),
-        partial(update_policies, setup, hyper, now, state.actor, held, actor_rows, excess, tagged),
+    team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
+    fitted = sharding.in_parallel(
+        partial(fit_critic, state.critic, setup.nets.value, hyper.clip, samples, tagged[Tag.CRITIC]),
+        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_samples, tagged[Tag.COST_CRITIC]),
+        partial(update_policies, setup, hyper, now, team, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, held, actor_metrics) = fitted
 
@@ -159,7 +159,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {
         **rollout.summary(batch, setup.shares_cost),
-        **rollout.limits_kept(batch, hyper, horizon),
+        **rollout.limit_metrics(batch, hyper),
         **constraint.metrics(setup, held, price(held.multiplier), excess),
         **_named("critic", critic_metrics),
         **_named("cost_critic", cost_critic_metrics),
@@ -180,8 +180,8 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
         partial(setup.scale, state.state_moments),
     )
 
-    def feel(cost: jax.Array, t: jax.Array) -> jax.Array:
-        return tasks.felt_cost(cost, jax.random.fold_in(tagged[Tag.FELT], t), hyper.cost_seen, hyper.cost_false)
+    def observe(cost: jax.Array, t: jax.Array) -> jax.Array:
+        return tasks.observed_cost(cost, jax.random.fold_in(tagged[Tag.OBSERVED_COST], t), hyper.cost_seen)
 
     after, batch, (obs, global_state) = rollout.collect(
         watched(setup, state.update),
@@ -190,7 +190,7 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
         normalisers,
         tagged[Tag.ACTION],
         setup.config.rollout_length,
-        feel,
+        observe,
     )
     moments = (
         running_moments.accumulate(state.obs_moments, obs),

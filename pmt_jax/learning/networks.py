@@ -110,7 +110,7 @@ class Networks:
         weights = self.fear_net.init(key, jnp.zeros(self.state_dim))
         return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start))
 
-    def awaken_fear(self, params: Params, cost_rate: jax.Array) -> Params:
+    def set_fear_to_cost_rate(self, params: Params, cost_rate: jax.Array) -> Params:
         """Starts fear at the observed `cost_rate` [N, K] if it began at nan; other weights stay as they are."""
         rate = jnp.clip(cost_rate, 1e-3, 1 - 1e-3)
         bias: jax.Array = params["params"][self.fear_head]["bias"].reshape(rate.shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,35 +17,34 @@ from .optimise import fit
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_steps
-from .types import Batch, Constraint, Hyper, Metrics, Params, PolicyRows, Tag, TrainState
+from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Tag, TrainState
+
+
+class Team(NamedTuple):
+    """What an update of policies takes: actors, constraints [N, K], samples [N, R, ...], excess [N, K] a step."""
+
+    actor: TrainState
+    constraint: Constraint
+    samples: PolicySamples
+    excess: jax.Array
 
 
 def update_policies(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    rows: PolicyRows,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
     """Updates every agent's policy and its constraint; then the noise of actions falls (`std_half_life`).
-
-    Args:
-      rows: leaves [N, R, ...]; excess: [N, K] in cost per step.
 
     Returns:
       actors, constraints [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
     """
     update = {"sequential": _sequential, "simultaneous": _simultaneous}[setup.method.order]
-    actor, constraint, metrics = update(setup, hyper, now, actor, constraint, rows, excess, tagged)
+    actor, constraint, metrics = update(setup, hyper, now, team, tagged)
     kl = metrics.pop("kl_per_agent")
     actor = dataclasses.replace(actor, params=setup.nets.scale_std(actor.params, now.std_factor))
     return actor, constraint, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
 
 
-def policy_rows(
+def policy_samples(
     setup: Setup,
     hyper: Hyper,
     price: jax.Array,
@@ -53,7 +52,7 @@ def policy_rows(
     advantage: jax.Array,
     cost_advantage: jax.Array,
     log_weight: jax.Array,
-) -> PolicyRows:
+) -> PolicySamples:
     """The batch as every agent's policy sees it, leaves [N, R, ...].
 
     Args:
@@ -66,7 +65,7 @@ def policy_rows(
     hybrid = hybrid_advantage(advantage[..., None], scaled, price)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
-    rows = PolicyRows(
+    samples = PolicySamples(
         obs=batch.obs,
         action=batch.action,
         mask=jnp.broadcast_to(jnp.asarray(setup.vector.spec.action_mask), batch.action.shape),
@@ -78,18 +77,11 @@ def policy_rows(
         log_weight=log_weight,
         factor=jnp.ones_like(batch.log_prob),
     )
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), rows)
+    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), samples)
 
 
 def _sequential(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    rows: PolicyRows,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
     """Updates agents in random order, each corrected by the ratios of those before it (HAPPO)."""
 
@@ -97,38 +89,30 @@ def _sequential(
         carry: tuple[TrainState, Constraint, jax.Array], i: jax.Array
     ) -> tuple[tuple[TrainState, Constraint, jax.Array], Metrics]:
         actor, constraint, factor = carry
-        mine = dataclasses.replace(select_agent(rows, i), factor=factor)
-        own, key = select_agent(constraint, i), jax.random.fold_in(tagged[Tag.ACTOR], i)
-        net, reach, metrics = update_policy(
-            setup, hyper, now, select_agent(actor, i), mine, excess[i] + own.lowered, key
-        )
+        net, own, mine, excess = select_agent(team._replace(actor=actor, constraint=constraint), i)
+        mine, key = dataclasses.replace(mine, factor=factor), jax.random.fold_in(tagged[Tag.ACTOR], i)
+        net, reach, metrics = update_policy(setup, hyper, now, net, mine, excess + own.lowered, key)
         log_ratio, metrics["kl_per_agent"] = policy_change(setup, net.params, mine)
-        own = respond(setup, hyper, now, own, mine, excess[i], log_ratio, reach)
+        own = respond(setup, hyper, now, own, mine, excess, log_ratio, reach)
         actor, constraint = jax.tree.map(lambda all_, one: all_.at[i].set(one), (actor, constraint), (net, own))
         # The factor corrects the distribution of the executed joint action: no regret weight in it.
         return (actor, constraint, factor * jnp.exp(log_ratio)), metrics
 
     order = jax.random.permutation(tagged[Tag.ORDER], setup.nets.num_agents)
-    start = (actor, constraint, jnp.ones_like(rows.factor[0]))
+    start = (team.actor, team.constraint, jnp.ones_like(team.samples.factor[0]))
     (actor, constraint, _), metrics = jax.lax.scan(one_agent, start, order)
     metrics["kl_per_agent"] = metrics["kl_per_agent"][jnp.argsort(order)]
     return actor, constraint, metrics
 
 
 def _simultaneous(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    actor: TrainState,
-    constraint: Constraint,
-    rows: PolicyRows,
-    excess: jax.Array,
-    tagged: dict[Tag, jax.Array],
+    setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
-    """Updates all agents from the same policies; a shared actor is fitted to the rows of all agents."""
+    """Updates all agents from the same policies; a shared actor is fitted to the samples of all agents."""
+    actor, constraint, samples, excess = team
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
-    per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), rows)
+    per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), samples)
     excesses = (excess + constraint.lowered).reshape(actors, -1, excess.shape[-1]).mean(1)
     actor, reach, metrics = jax.vmap(lambda *each: update_policy(setup, hyper, now, *each))(
         actor, per_actor, excesses, keys
@@ -138,9 +122,9 @@ def _simultaneous(
         return jnp.broadcast_to(x, (setup.nets.num_agents, *x.shape[1:]))
 
     params = jax.tree.map(of_all, actor.params)
-    log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: policy_change(setup, *each))(params, rows)
+    log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: policy_change(setup, *each))(params, samples)
     constraint = jax.vmap(lambda *each: respond(setup, hyper, now, *each))(
-        constraint, rows, excess, log_ratio, of_all(reach)
+        constraint, samples, excess, log_ratio, of_all(reach)
     )
     return actor, constraint, metrics
 
@@ -150,12 +134,12 @@ def select_agent(tree: Any, i: jax.Array | int) -> Any:
     return jax.tree.map(lambda x: x[i], tree)
 
 
-def policy_change(setup: Setup, params: Params, rows: PolicyRows) -> tuple[jax.Array, jax.Array]:
+def policy_change(setup: Setup, params: Params, samples: PolicySamples) -> tuple[jax.Array, jax.Array]:
     """How far a policy is from the one that acted: log-ratios [R], and the mean KL(old || new) in nats."""
-    rows = sharding.shard(rows)
-    mean, std = setup.nets.policy(params, rows.obs)
-    kl = distributions.kl(rows.mean, rows.std, mean, std, rows.mask).mean()
-    return distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob, kl
+    samples = sharding.shard(samples)
+    mean, std = setup.nets.policy(params, samples.obs)
+    kl = distributions.kl(samples.mean, samples.std, mean, std, samples.mask).mean()
+    return distributions.log_prob(samples.action, mean, std, samples.mask) - samples.log_prob, kl
 
 
 def update_policy(
@@ -163,11 +147,11 @@ def update_policy(
     hyper: Hyper,
     now: Schedule,
     net: TrainState,
-    rows: PolicyRows,
+    samples: PolicySamples,
     violation: jax.Array,
     key: jax.Array,
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """One policy's step on its rows [R, ...].
+    """One policy's step on its samples [R, ...].
 
     Args:
       violation: [K] cost per step, how far the costs are beyond what a trust region is to keep, its lowered limit.
@@ -176,37 +160,38 @@ def update_policy(
       the network; [] cost per step, the most that a trust region's step promised to take off the cost, else 0; metrics.
     """
     if setup.method.constraint == "trust_region":
-        return trust_region_steps(setup, hyper, now, net, rows, violation, key)
-    net, metrics = _clipped_epochs(setup, hyper, now, net, rows, key)
+        return trust_region_steps(setup, hyper, now, net, samples, violation, key)
+    net, metrics = _clipped_epochs(setup, hyper, now, net, samples, key)
     return net, jnp.zeros(()), metrics
 
 
 def _clipped_epochs(
-    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, rows: PolicyRows, key: jax.Array
+    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, samples: PolicySamples, key: jax.Array
 ) -> tuple[TrainState, Metrics]:
     """Epochs of clipped policy gradient (PPO)."""
 
-    def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
-        mean, std = setup.nets.policy(params, rows.obs)
-        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
-        gain = clipped_surrogate(log_ratio, rows.log_weight, rows.advantage, rows.factor, hyper.clip)
-        entropy = distributions.entropy(std, rows.mask).mean()
-        outside = jnp.abs(jnp.exp(log_ratio + rows.log_weight) - 1) > hyper.clip
-        metrics = {"entropy": entropy, "clipped": outside.mean(), "std": (std * rows.mask).sum() / rows.mask.sum()}
+    def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
+        mean, std = setup.nets.policy(params, samples.obs)
+        log_ratio = distributions.log_prob(samples.action, mean, std, samples.mask) - samples.log_prob
+        gain = clipped_surrogate(log_ratio, samples.log_weight, samples.advantage, samples.factor, hyper.clip)
+        entropy = distributions.entropy(std, samples.mask).mean()
+        outside = jnp.abs(jnp.exp(log_ratio + samples.log_weight) - 1) > hyper.clip
+        deviation = (std * samples.mask).sum() / samples.mask.sum()
+        metrics = {"entropy": entropy, "clipped": outside.mean(), "std": deviation}
         return -gain.mean() - hyper.entropy_coef * entropy, metrics
 
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    new, metrics = fit(net, loss, rows, key, learning_rate=now.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
-    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, rows)
+    new, metrics = fit(net, loss, samples, key, learning_rate=now.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
+    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, samples)
     return TrainState(params, new.opt_state), metrics
 
 
 def _limit_kl(
-    setup: Setup, kl_max: jax.Array | float, old: Params, new: Params, rows: PolicyRows
+    setup: Setup, kl_max: jax.Array | float, old: Params, new: Params, samples: PolicySamples
 ) -> tuple[Params, jax.Array]:
     """Weights on the way from `old` to `new` where KL(old || new) is about `kl_max`, and that share of the way; `new`
     itself, bit for bit, and 1 where it is no further. To second order the divergence is the way's square.
     """
-    _, kl = policy_change(setup, new, rows)
+    _, kl = policy_change(setup, new, samples)
     share = jnp.sqrt(jnp.minimum(1.0, kl_max / jnp.maximum(kl, 1e-12)))
     return jax.tree.map(lambda x, y: jnp.where(share < 1, x + share * (y - x), y), old, new), share

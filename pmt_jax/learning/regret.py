@@ -20,7 +20,7 @@ def appraise_regret(
 
     Returns:
       the networks of all agents, log w [T, B, N] (0 without regret), and metrics: mean regret per action entry on
-      costly steps, what it would be on safe ones were they costly, and the weight w over all rows.
+      costly steps, what it would be on safe ones were they costly, and the weight w over all samples.
     """
     if net is None:
         return None, jnp.zeros_like(batch.log_prob), {}
@@ -30,18 +30,18 @@ def appraise_regret(
     before = logits(net.params, state, batch.action)
     target = smoothed(deliberateness((batch.action - batch.mean) / batch.std))
     costly = (batch.cost.max(-1, keepdims=True) > 0) * mask
-    rows = (state, batch.action, target, jax.nn.sigmoid(before), costly)
-    rows = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), rows)
+    samples = (state, batch.action, target, jax.nn.sigmoid(before), costly)
+    samples = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), samples)
 
-    def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
-        state, action, target, old, weight = rows
+    def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
+        state, action, target, old, weight = samples
         logits = setup.nets.regret(params, state, action)
         return appraisal_loss(cross_entropy(logits, target), logits, old, weight, hyper.regret_l2), {}
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
     passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.emotion_lr, "max_grad_norm": hyper.max_grad_norm}
-    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, *each[1:], **limits, **passes))(net, rows, keys)
+    learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, *each[1:], **limits, **passes))(net, samples, keys)
     # Adam's momentum would move a network that had nothing to learn from.
     learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
     after = logits(learned.params, state, batch.action)
@@ -63,7 +63,7 @@ def appraise_regret(
 
 
 def regret(logits: jax.Array, cost: jax.Array) -> jax.Array:
-    """Regret per action entry, felt only where the step was costly: sigmoid(l) 1[C > 0] (Eq. 13).
+    """Regret per action entry, where the step was costly: sigmoid(l) 1[C > 0] (Eq. 13).
 
     Args:
       logits: [..., A]; cost: [..., K] in [0, 1]; with several costs any of them will do.

@@ -1,4 +1,4 @@
-"""Rollout: the team acts in all environments for some steps, and the batch keeps what it saw, did and felt."""
+"""Rollout: the team acts in all environments for some steps, and a batch keeps observations, actions and costs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .. import limits
 from ..tasks import Outcome, State, VectorEnv
 from . import sharding
 from .maths import distributions
-from .setup import held_limit
+from .setup import limit_less_margin
 from .types import Batch, Hyper, RolloutState
 
-Policy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
+GaussianPolicy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
 Normalise = Callable[[jax.Array], jax.Array]
-Feel = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K] of a step, its number [] -> felt cost
+ObserveCost = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K], the step's number -> observed cost
 
 
 def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutState:
@@ -47,18 +47,18 @@ def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutSta
 def collect(
     vector: VectorEnv,
     state: RolloutState,
-    policy: Policy,
+    policy: GaussianPolicy,
     normalise: tuple[Normalise, Normalise],
     key: jax.Array,
     steps: int,
-    feel: Feel = lambda cost, t: cost,
+    observe: ObserveCost = lambda cost, t: cost,
 ) -> tuple[RolloutState, Batch, tuple[jax.Array, jax.Array]]:
     """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
 
     Args:
       policy: of normalised observations.
       normalise: for observations and for global states.
-      feel: what of a step's cost the team notices; all of it by default.
+      observe: what of a step's cost the learner observes; all of it by default.
 
     Returns:
       the state to continue from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
@@ -73,11 +73,11 @@ def collect(
         mean, std = policy(obs)
         action = mean + std * jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         next_vector, outcome = step_per_device(state.vector, action * mask)
-        felt = feel(outcome.cost, t)
+        observed = observe(outcome.cost, t)
         sums = RolloutState(
             next_vector,
             state.reward_sum + outcome.reward,
-            state.cost_sum + felt,
+            state.cost_sum + observed,
             state.true_cost_sum + outcome.cost,
             state.length + 1,
         )
@@ -89,7 +89,7 @@ def collect(
             "std": jnp.broadcast_to(std, mean.shape),
             "state": normalise_state(env.global_state),
             "next_state": normalise_state(outcome.next_global_state),
-            "cost": felt,
+            "cost": observed,
             "whole": state.vector.elapsed == state.length,
         }
         return _clear_finished(sums, outcome), (_record(seen, outcome, sums), (env.obs, env.global_state))
@@ -128,36 +128,36 @@ def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
     return jnp.sum(x * finished, (0, 1)) / finished.sum()  # 0 / 0 is nan
 
 
-def limits_kept(batch: Batch, hyper: Hyper, horizon: int) -> dict[str, jax.Array]:
-    """How the episodes that ended kept their limits, scalars; nan if none ended.
+def limit_metrics(batch: Batch, hyper: Hyper) -> dict[str, jax.Array]:
+    """Metrics of the episodes that ended, against their limits: scalars, nan if none ended.
 
     within_limit: share of them in which each cost of each agent is within its limit. episode_cost_beyond: their mean
     cost beyond it, 0 of an episode within it, in the limit's unit: that of the agent furthest beyond, of several costs
     the sum.
     """
-    beyond = cost_beyond(batch.episode_cost, batch.true_episode_cost, hyper, horizon)
+    beyond = cost_beyond(batch.episode_cost, batch.true_episode_cost, hyper)
     return {
         "within_limit": finished_mean(batch, jnp.all(beyond == 0, axis=(-2, -1))),
         "episode_cost_beyond": finished_mean(batch, beyond.max(-2).sum(-1)),
     }
 
 
-def cost_beyond(felt: jax.Array, true: jax.Array, hyper: Hyper, horizon: int) -> jax.Array:
-    """How far episode costs [..., K] are beyond their limits, 0 within: the true one, of several each felt one.
+def cost_beyond(observed: jax.Array, true: jax.Array, hyper: Hyper) -> jax.Array:
+    """How far episode costs [..., K] are beyond their limits, 0 within: the true one, of several each observed one.
 
-    The limit is on what is felt, so a true cost counts as what it is expected to be felt as, see `Setup.limits`.
+    The limit is on observed costs, so a true cost counts as the observed one that it is expected to give.
     """
-    cost = felt if felt.shape[-1] > 1 else hyper.cost_seen * true + hyper.cost_false * (horizon - true)
-    return jnp.maximum(limits.excess(cost, held_limit(hyper, 0.0), jnp), 0.0)
+    cost = observed if observed.shape[-1] > 1 else hyper.cost_seen * true
+    return jnp.maximum(limits.excess(cost, limit_less_margin(hyper, 0.0), jnp), 0.0)
 
 
 def summary(batch: Batch, shares_cost: bool = False) -> dict[str, jax.Array]:
     """Metrics of a batch, scalars; episode metrics are means over the episodes that ended (nan if none did).
 
     episode_reward, episode_cost: undiscounted sums over an episode, the cost of one agent (mean over agents; costs
-    summed over K), and beside it each agent's and cost's, see `limits.columns`. violation_rate: share of steps with a
-    cost above 0 for some agent. step_reward, step_cost: means per step. Costs are as felt; true_episode_cost,
-    true_violation_rate and true_step_cost are the same of the true costs (see `envs.vector.felt_cost`).
+    summed over K), and next to it each agent's and cost's, see `limits.columns`. violation_rate: share of steps with a
+    cost above 0 for some agent. step_reward, step_cost: means per step. Costs are as observed; true_episode_cost,
+    true_violation_rate and true_step_cost are the same of the true costs (see `envs.vector.observed_cost`).
 
     Args:
       shares_cost: whether the task declares that agents share their costs; `cost_spread` then says how far they differ.
@@ -198,5 +198,5 @@ def _worst_cost(batch: Batch) -> jax.Array:
 
 
 def flatten_steps(x: jax.Array) -> jax.Array:
-    """[T, B, ...] as rows [R, ...]."""
+    """[T, B, ...] as samples [R, ...]."""
     return x.reshape(-1, *x.shape[2:])

@@ -36,7 +36,7 @@ class Setup:
     """What is fixed before training: settings, a row of the method table, the task and the networks' functions.
 
     With `trials`, config.seeds counts these, and they take the place of the config's traced numbers and seeds.
-    With `mesh`, it is split over several devices (see sharding.py). With more than one of `jobs`, so many worker
+    With `mesh`, it is split over several devices (see sharding.py). With more than one of `workers`, so many worker
     processes share its seeds. With `debug`, its program checks that all it computes is finite (see debug.py).
     """
 
@@ -46,13 +46,13 @@ class Setup:
     nets: networks.Networks
     trials: Trials | None = None
     mesh: jax.sharding.Mesh | None = None
-    jobs: int = 1
+    workers: int = 1
     debug: bool = False
 
     @property
     def limits(self) -> Limits:
         """What the learner holds the costs of every agent to, as it observes them."""
-        return Limits.of_run(self.config, self.vector.spec, self.vector.horizon)
+        return Limits.of_run(self.config, self.vector.spec)
 
     @property
     def limits_of_seeds(self) -> list[Limits]:
@@ -95,7 +95,7 @@ class Setup:
         return self.trials.hyper, keys(self.trials.seed), (0 if jnp.ndim(self.trials.hyper.clip) else None, 0)
 
 
-def held_limit(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
+def limit_less_margin(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
     """The limits [] or [K] of an episode's costs less a margin, a share of them; traced."""
     return jnp.asarray(hyper.cost_limit) * (1 - margin)
 
@@ -114,22 +114,13 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
         raise UsageError(found)
     method = METHODS[config.method]
     if env is None:
-        env = tasks.make(config.task, config.physics, **_options(config))
+        env = tasks.make(config.task, config.physics, **dict(config.env))
     else:
         tasks.check(env)
     _check_limits(config, env.spec)
     nets = networks.build(config, env.spec, method.share_actor)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
     return Setup(config, method, vector, nets)
-
-
-def _options(config: Config) -> dict[str, Any]:
-    """The task's options in `env`, which cannot be called as what `tasks.make` takes besides them."""
-    options = dict(config.env)
-    for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
-        if option in options:
-            raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
-    return options
 
 
 def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:

@@ -2,7 +2,7 @@
 
 Seeds exchange only metrics, so as many devices as possible share the seeds; the rest share each seed's environments.
 Environments step on their own device (`per_device`): XLA's partitioner cannot look into physics engines and would give
-all of them to every device. On a CPU each network is then fitted by one device (`side_by_side`). Elsewhere the
+all of them to every device. On a CPU each network is then fitted by one device (`in_parallel`). Elsewhere the
 learner's rows are gathered once for each network's epochs (`replicate`), every minibatch is cut into equal parts
 (`shard`), and the partitioner sums the gradients. Random numbers do not depend on the number of devices. Without a mesh
 these functions return their argument, so one device runs the same program as without them.
@@ -126,7 +126,7 @@ def replicate(tree: Any) -> Any:
     return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P())
 
 
-def side_by_side(*parts: functools.partial[Any]) -> tuple[Any, ...]:
+def in_parallel(*parts: functools.partial[Any]) -> tuple[Any, ...]:
     """What each of `parts` returns; none needs another's result.
 
     Devices of a CPU take whole parts, the first ones the first device: it computes the gradient of a small minibatch

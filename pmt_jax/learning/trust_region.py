@@ -19,7 +19,7 @@ from .maths.pytree import pytree
 from .optimise import shuffled
 from .schedules import Schedule
 from .setup import Setup
-from .types import Hyper, Metrics, PolicyRows, TrainState
+from .types import Hyper, Metrics, PolicySamples, TrainState
 
 EPS = 1e-8
 LINE_SEARCH_STEPS = 10
@@ -32,11 +32,11 @@ def trust_region_steps(
     hyper: Hyper,
     now: Schedule,
     net: TrainState,
-    rows: PolicyRows,
+    samples: PolicySamples,
     violation: jax.Array,
     key: jax.Array,
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """`trust_steps` constrained steps (MACPO), each on its part of the shuffled rows; one step takes the whole batch.
+    """`trust_steps` constrained steps (MACPO), each on its part of the shuffled samples; one step takes all of them.
 
     The optimiser's state is not touched. With several costs each step constrains the one most beyond its limit.
 
@@ -47,16 +47,16 @@ def trust_region_steps(
       the network; [] cost per step, the most that a step promised to take off the cost; metrics. Means over steps.
     """
     start, unravel = ravel_pytree(net.params)
-    spread = rows.cost_advantage.std(0) + 1e-5
+    spread = samples.cost_advantage.std(0) + 1e-5
     worst = jnp.argmax(violation / spread)
-    rows = dataclasses.replace(rows, cost_advantage=rows.cost_advantage[:, worst])
+    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[:, worst])
     steps = setup.config.trust_steps
     if steps > 1:
-        shuffle = shuffled(key, rows.log_prob.shape[0])
-        rows = jax.tree.map(lambda x: x[shuffle], rows)
-    parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), rows)
+        shuffle = shuffled(key, samples.log_prob.shape[0])
+        samples = jax.tree.map(lambda x: x[shuffle], samples)
+    parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), samples)
 
-    def one_step(flat: jax.Array, part: PolicyRows) -> tuple[jax.Array, Metrics]:
+    def one_step(flat: jax.Array, part: PolicySamples) -> tuple[jax.Array, Metrics]:
         return _trust_region_step(setup, hyper, now, flat, unravel, part, violation[worst])
 
     flat, metrics = jax.lax.scan(one_step, start, parts)
@@ -70,36 +70,36 @@ def _trust_region_step(
     now: Schedule,
     start: jax.Array,
     unravel: Callable[[jax.Array], Any],
-    rows: PolicyRows,
+    samples: PolicySamples,
     violation: jax.Array,
 ) -> tuple[jax.Array, Metrics]:
     """One constrained step from the flat weights `start` [P]: direction, line search.
 
     This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
     """
-    rows = sharding.shard(rows)
+    samples = sharding.shard(samples)
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return setup.nets.policy(unravel(flat), rows.obs)
+        return setup.nets.policy(unravel(flat), samples.obs)
 
     mean0, std0 = jax.lax.stop_gradient(policy(start))
 
     def objectives(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Loss and cost surrogates."""
         mean, std = policy(flat)
-        log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
-        ratio = jnp.exp(log_ratio + rows.log_weight)  # weighted by regret as in Eq. 15
-        return -jnp.mean(rows.factor * ratio * rows.advantage), jnp.mean(rows.factor * ratio * rows.cost_advantage)
+        log_ratio = distributions.log_prob(samples.action, mean, std, samples.mask) - samples.log_prob
+        ratio = samples.factor * jnp.exp(log_ratio + samples.log_weight)  # weighted by regret as in Eq. 15
+        return -jnp.mean(ratio * samples.advantage), jnp.mean(ratio * samples.cost_advantage)
 
     def divergence(flat: jax.Array) -> jax.Array:
-        return distributions.kl(mean0, std0, *policy(flat), rows.mask).mean()
+        return distributions.kl(mean0, std0, *policy(flat), samples.mask).mean()
 
     (loss0, cost0), pull = jax.vjp(objectives, start)
     one, zero = jnp.ones_like(loss0), jnp.zeros_like(loss0)
     (g,), (b,) = pull((one, zero)), pull((zero, one))
     _, fisher = jax.linearize(jax.grad(divergence), start)
     # What the steps before this one are expected to have changed counts towards the limit.
-    c = violation + cost0 - jnp.mean(rows.factor * jnp.exp(rows.log_weight) * rows.cost_advantage)
+    c = violation + cost0 - jnp.mean(samples.factor * jnp.exp(samples.log_weight) * samples.cost_advantage)
     uncoupled, _ = ravel_pytree(setup.nets.is_std(unravel(start)))
     direction = constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, now.kl_limit, uncoupled)
 
@@ -116,8 +116,8 @@ def _trust_region_step(
     _, std = policy(flat)
     return flat, {
         "loss": loss,
-        "entropy": distributions.entropy(std, rows.mask).mean(),
-        "std": (std * rows.mask).sum() / rows.mask.sum(),
+        "entropy": distributions.entropy(std, samples.mask).mean(),
+        "std": (std * samples.mask).sum() / samples.mask.sum(),
         "case": direction.case.astype(loss.dtype),
         "reach": direction.reach,
         "line_search_steps": tried.astype(loss.dtype),
@@ -157,7 +157,7 @@ def conjugate_gradient(hvp: Hvp, b: jax.Array, iterations: int = 10, tolerance: 
 def solve(hvp: Hvp, b: jax.Array, uncoupled: jax.Array | None = None) -> jax.Array:
     """x [P] with H x = b: exact where `uncoupled`, by conjugate gradient elsewhere.
 
-    Ten iterations do not reach the standard deviations of a Gaussian: their curvature is small beside that of the
+    Ten iterations do not reach the standard deviations of a Gaussian: their curvature is small next to that of the
     network that makes its mean, and a step four times too short along them was seen.
 
     Args:

@@ -9,6 +9,7 @@ import enum
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..config.settings import HYPER_FIELDS, Hyper
@@ -33,7 +34,7 @@ class Tag(enum.IntEnum):
     COST_CRITIC = 6
     FEAR = 7
     REGRET = 8
-    FELT = 9
+    OBSERVED_COST = 9
 
 
 @pytree
@@ -75,7 +76,7 @@ class Batch:
       obs: [T, B, N, O]; action: [T, B, N, A] as sampled, not clipped; log_prob: [T, B, N] and mean: [T, B, N, A]
         under the policy that acted; std: [T, B, N, A] likewise.
       state, next_state: [T, B, S]; the next state is the one before any reset.
-      reward: [T, B]; cost: [T, B, N, K] as felt (see `envs.vector.felt_cost`); true_cost: the same as it was.
+      reward: [T, B]; cost: [T, B, N, K] as observed (see `envs.vector.observed_cost`); true_cost: the same as it was.
       terminated, truncated: [T, B] bool, never both.
       info: {name: [T, B]}.
       non_finite: [T, B] bool, quarantined steps; cost_out_of_range: [T, B] bool, steps with a cost outside [0, 1].
@@ -133,8 +134,8 @@ class Constraint:
 
 
 @pytree
-class PolicyRows:
-    """The rows of a policy update; R = T * B rows, with a leading [N] before an agent is chosen.
+class PolicySamples:
+    """The samples of a policy update; R = T * B samples, with a leading [N] before an agent is chosen.
 
     Attributes:
       obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
@@ -208,6 +209,17 @@ class Best:
     state: LearnerState
     reward: np.ndarray
     cost: np.ndarray
+
+    @classmethod
+    def initial(cls, state: LearnerState) -> Best:
+        """Before anything is known of a run of any number of seeds."""
+        nothing = np.full(state.update.shape, np.inf, np.float32)
+        return cls(_copy(state), -nothing, nothing)
+
+
+@jax.jit
+def _copy(state: LearnerState) -> LearnerState:
+    return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
 
 
 Metrics = dict[str, jax.Array]

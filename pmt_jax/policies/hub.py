@@ -1,7 +1,7 @@
 """Trained policies that come with the package, one a task and method, under names like `hub:ant_2x4/r4sg`.
 
 Each is a small npz: the run's settings, the part of its best seed's learner state that acts, and its evaluation.
-SHA256SUMS beside them has the checksum of each, as `sha256sum` writes it. Kernels are 8-bit integers with a scale per
+SHA256SUMS next to them has the checksum of each, as `sha256sum` writes it. Kernels are 8-bit integers with a scale per
 output, the rest is stored as it is: docs/howto/pretrained.md has the error.
 """
 
@@ -93,7 +93,7 @@ def save(name: str, config: Config, state: ActingState, facts: dict[str, Any]) -
     )
 
 
-def tell(name: str, facts: dict[str, Any]) -> None:
+def store_facts(name: str, facts: dict[str, Any]) -> None:
     """Replaces the facts that `about` returns.
 
     Raises:
@@ -122,7 +122,7 @@ def _read(name: str) -> dict[str, np.ndarray]:
     file = file_of(name)
     if _checksums().get(file.name, "none") != _checksum(file):
         raise UsageError(
-            f"{name} is damaged: {file} is missing or not as {CHECKSUMS} beside it lists it; install pmt-jax anew"
+            f"{name} is damaged: {file} is missing or not as {CHECKSUMS} next to it lists it; install pmt-jax anew"
         )
     with np.load(file) as table:
         return dict(table)

@@ -68,7 +68,7 @@ def _measure(name: str, episodes: int) -> dict[str, Any]:
     run, state = hub.load(name)
     (row,) = evaluate_states(run, state, episodes, deterministic=True, fresh=True)
     facts = hub.about(name) | {"episodes": episodes, "engine": run.vector.env.engine, "figures": figures(row)}
-    hub.tell(name, facts)
+    hub.store_facts(name, facts)
     return facts
 
 

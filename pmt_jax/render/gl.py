@@ -9,7 +9,7 @@ from ..errors import UsageError
 from ..probe import run_python
 
 _BACKENDS = {"linux": ("egl", "osmesa", "glfw"), "darwin": ("cgl", "glfw")}
-_PROBE = """
+PROBE = """
 import mujoco, mujoco.{0} as platform
 context = platform.GLContext(8, 8)
 context.make_current()
@@ -28,7 +28,7 @@ def obstacle(backend: str) -> str | None:
 
     A backend that fails leaves PyOpenGL unusable for the next, or kills its process, so each is tried in a new one.
     """
-    return run_python(_PROBE.format(backend))
+    return run_python(PROBE.format(backend))
 
 
 def choose() -> str:

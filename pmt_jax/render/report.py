@@ -107,7 +107,7 @@ def _key(group: Group, look: plot.Look) -> str:
 
 
 def _run_section(log: RunLog, episodes: int) -> list[str]:
-    played = _or_reason(lambda: _evaluation(log.folder, episodes)) + _or_reason(lambda: _replay(log.folder))
+    played = _or_reason(lambda: evaluation(log.folder, episodes)) + _or_reason(lambda: _replay(log.folder))
     return [
         f"<section>\n<h2>{html.escape(log.folder.name)}</h2>",
         f"<p>{html.escape(_summary(log))}</p>",
@@ -137,7 +137,8 @@ def _or_reason(make: Callable[[], list[str]]) -> list[str]:
         return [f"<p>{html.escape(str(error))}</p>"]
 
 
-def _evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
+def evaluation(folder: pathlib.Path, episodes: int) -> list[str]:
+    """Lines of HTML: the run's policies on new episodes, with sampled and with mean actions."""
     kinds = {"sampled": False, "mean": True}
     found = {kind: evaluate.evaluate_run(folder, episodes, mean) for kind, mean in kinds.items()}
     results = [(kind, row) for kind in kinds for row in found[kind]]

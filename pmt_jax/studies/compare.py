@@ -1,112 +1,106 @@
-"""Rows of a table against a baseline: effect sizes, and tests corrected for their number."""
+"""`pmt compare`: two runs of one task, seeds of one against seeds of the other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import dataclasses
+import math
+import pathlib
 
 import numpy as np
 
+from .. import formats
 from ..errors import UsageError
-from ..tasks import did_you_mean
-from . import statistics
-from .rows import Row, compared
+from . import plot, statistics
+from .rows import TableRow, compared, rows
+from .run_log import Group, groups, read_all
 
-Estimate = dict[str, float | None]
-
-
-class Comparison(NamedTuple):
-    """A row against the baseline's, by column as `more reward`, `less cost`.
-
-    Attributes:
-      better: {name: {probability, low, high}} of a seed doing better, None if a seed has no score.
-      p: {name: p} of Mann and Whitney's U test with Holm's correction over the rows of a task and the column; None
-        if a seed has no score.
-    """
-
-    better: dict[str, Estimate]
-    p: dict[str, float | None]
+NOTES = (
+    "A seed's score is its mean over the last tenth of its steps. Scores are means over seeds [95 %, Student].",
+    "difference: the first less the second [95 %, Welch; of shares Newcombe].",
+    "P: probability that a seed of the first has more reward (less cost) than one of the second; ties half [Newcombe].",
+    "-: a seed has no score; [-]: one seed has no interval.",
+)
 
 
-def with_baseline(rows: Sequence[Row], baseline: str) -> dict[tuple[str, str], Comparison]:
-    """{(task, label): comparison} of every row whose task has the baseline, but the baseline itself.
+def compare(first: pathlib.Path, second: pathlib.Path, picture: pathlib.Path | None = None) -> str:
+    """The comparison as text: reward, cost and the share of seeds within the limit, one line each.
 
     Args:
-      baseline: a row's label, or a method with no more than one row per task.
+      first, second: run folders, or folders of runs that differ in nothing but their seeds.
+      picture: where the curves of both are drawn (.png, .svg or .pdf).
 
     Raises:
-      UsageError: no row, or several of one task, have the baseline's name.
+      UsageError: a folder holds no run or several, the tasks differ, or only one of the two was evaluated in training.
     """
-    columns = compared(rows)
-    found = {}
-    for task, rival in baselines(rows, baseline).items():
-        ours = [row for row in rows if row.task == task and row is not rival]
-        for row, p in zip(ours, tests(ours, rival, columns), strict=True):
-            found[task, row.label] = Comparison(_improvements([row], [rival], columns), p)
-    return found
+    if picture:
+        plot.check_ending(picture)
+    (ours, our_group), (theirs, their_group) = _side(first), _side(second)
+    if first.resolve() == second.resolve():
+        raise UsageError(f"{first} and {second} are the same run; name two")
+    if ours.task != theirs.task:
+        raise UsageError(f"{first} is a run of {ours.task} and {second} of {theirs.task}; compare runs of one task")
+    if ours.source != theirs.source:
+        raise UsageError(f"cannot compare {first} with {second}: only one of them was evaluated in training")
+    names = _names(ours, theirs, first, second)
+    if picture:
+        named = zip(names, (our_group, their_group), strict=True)
+        curves = [dataclasses.replace(group, settings=name[len(group.method) + 1 :]) for name, group in named]
+        plot.draw(curves, picture)
+    head = [ours.task, *(f"{name} ({len(row.beyond)} seeds)" for name, row in zip(names, (ours, theirs), strict=True))]
+    head += ["difference", "P"]
+    reward, cost = compared([ours, theirs])
+    body = [_line(reward, ours.score(reward), theirs.score(reward), 1)]
+    body += [_line(f"{cost} (limit {_both(ours, theirs, cost)})", ours.score(cost), theirs.score(cost), -1)]
+    body += [_within(ours.beyond, theirs.beyond)]
+    return formats.write(head, body, "text", NOTES)
 
 
-def overall(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Estimate]]:
-    """By label, the improvements over all tasks that have the baseline, for rows that are in all of several."""
-    rivals = baselines(rows, baseline)
-    result = {}
-    for label in dict.fromkeys(row.label for row in rows):
-        ours = {r.task: r for r in rows if r.label == label and r.task in rivals and r is not rivals[r.task]}
-        if len(rivals) > 1 and set(ours) == set(rivals):
-            result[label] = _improvements(list(ours.values()), [rivals[task] for task in ours], compared(rows))
-    return result
+def _side(path: pathlib.Path) -> tuple[TableRow, Group]:
+    """The one kind of run at or below `path`: its scores, and its curves."""
+    logs = read_all([path])
+    found = rows(logs)
+    if len(found) > 1:
+        listing = ", ".join(f"{row.label} on {row.task}" for row in found[:4])
+        raise UsageError(f"{path} holds {len(found)} kinds of runs ({listing}); name one, or take pmt table for all")
+    return found[0], groups([log.thinned(plot.POINTS) for log in logs])[0]
 
 
-def tests(ours: Sequence[Row], rival: Row, columns: tuple[str, str]) -> list[dict[str, float | None]]:
-    """Each row's p against `rival`, see `Comparison`."""
-    result: list[dict[str, float | None]] = [{} for _ in ours]
-    for name, column in zip(names(columns), columns, strict=True):
-        pairs = [_scores([row, rival], column) for row in ours]
-        corrected = iter(statistics.holm([statistics.u_test(*pair) for pair in pairs if pair]))
-        for p, pair in zip(result, pairs, strict=True):
-            p[name] = next(corrected) if pair else None
-    return result
+def _names(ours: TableRow, theirs: TableRow, first: pathlib.Path, second: pathlib.Path) -> list[str]:
+    """What sets the two apart: their methods, or else their folders too."""
+    if ours.method != theirs.method:
+        return [ours.method, theirs.method]
+    return [f"{ours.method} {path}" for path in (first, second)]
 
 
-def baselines(rows: Sequence[Row], baseline: str) -> dict[str, Row]:
-    """The row that the others are held against, of every task that has it.
-
-    Raises:
-      UsageError: no row, or several of one task, have that name.
-    """
-    result: dict[str, Row] = {}
-    for task in dict.fromkeys(row.task for row in rows):
-        here = [row for row in rows if row.task == task]
-        chosen = [row for row in here if row.label == baseline] or [row for row in here if row.method == baseline]
-        if len(chosen) > 1:
-            listing = ", ".join(f"'{row.label}'" for row in chosen)
-            raise UsageError(f"'{baseline}' means several rows of {task}: {listing}; name one of them")
-        if chosen:
-            result[task] = chosen[0]
-    if not result:
-        raise UsageError(f"no row is called '{baseline}'{did_you_mean(baseline, {row.label for row in rows})}")
-    return result
+def _both(ours: TableRow, theirs: TableRow, cost: str) -> str:
+    limits = dict.fromkeys(row.limit_on(cost) for row in (ours, theirs))
+    return " and ".join(limits)
 
 
-def names(columns: tuple[str, str]) -> tuple[str, str]:
-    """What it means to be better in the columns of the reward and of the cost."""
-    return f"more {columns[0]}", f"less {columns[1]}"
+def _line(name: str, x: np.ndarray, y: np.ndarray, sign: int) -> list[str]:
+    """A measure's scores [seeds] of both sides, of which more (sign 1) or less (-1) is better."""
+    cells = [_cell(float(side.mean()), statistics.mean_interval(side)) for side in (x, y)]
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return [name, *cells, "-", "-"]
+    difference = _cell(float(x.mean() - y.mean()), statistics.difference_interval(x, y))
+    return [name, *cells, difference, _better(sign * x, sign * y)]
 
 
-def _improvements(ours: Sequence[Row], theirs: Sequence[Row], columns: tuple[str, str]) -> dict[str, Estimate]:
-    result: dict[str, Estimate] = {}
-    for name, column, sign in zip(names(columns), columns, (1, -1), strict=True):
-        x, y = (_scores(side, column) for side in (ours, theirs))
-        if x is None or y is None:
-            result[name] = dict.fromkeys(("probability", "low", "high"))
-            continue
-        x, y = ([sign * scores for scores in side] for side in (x, y))
-        low, high = statistics.improvement_interval(x, y)
-        result[name] = {"probability": statistics.probability_of_improvement(x, y), "low": low, "high": high}
-    return result
+def _within(ours: np.ndarray, theirs: np.ndarray) -> list[str]:
+    """The share of seeds whose cost is within the limit; a seed without a score is not."""
+    x, y = (np.asarray(beyond <= 0, float) for beyond in (ours, theirs))
+    interval = statistics.share_difference_interval(int(x.sum()), x.size, int(y.sum()), y.size)
+    difference = _cell(float(x.mean() - y.mean()), interval)
+    counts = [f"{int(side.sum())} of {side.size}" for side in (x, y)]
+    return ["seeds within the limit", *counts, difference, _better(x, y)]
 
 
-def _scores(rows: Sequence[Row], column: str) -> list[np.ndarray] | None:
-    """The seeds' scores of each row; None if one has none."""
-    found = [row.score(column) for row in rows]
-    return found if all(np.isfinite(scores).all() for scores in found) else None
+def _better(x: np.ndarray, y: np.ndarray) -> str:
+    return _cell(statistics.probability_of_improvement([x], [y]), statistics.improvement_interval([x], [y]))
+
+
+def _cell(middle: float, interval: statistics.Interval) -> str:
+    if not math.isfinite(middle):
+        return "-"
+    ends = ", ".join(f"{x:.4g}" for x in interval) if math.isfinite(interval[0]) else "-"
+    return f"{middle:.4g} [{ends}]"

@@ -55,7 +55,7 @@ METHOD_COLOURS = {
 }
 OTHER_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, GREY)  # of settings of one method, of methods not in METHODS
 DASHES = ("", "6 2", "1.5 2", "6 2 1.5 2")  # in line widths, as SVG has them
-MOST_BANDS = 3  # curves in a panel; more are lines, with the spread over seeds beside them
+MOST_BANDS = 3  # curves in a panel; more are lines, with the spread over seeds next to them
 ENDINGS = (".png", ".svg", ".pdf")
 INK = "#808182"  # stands for the reader's own text colour in pictures inside pages
 
@@ -122,14 +122,14 @@ def caption(shown: Sequence[Group]) -> str:
 
 
 def panels(shown: Sequence[Group], wanted: dict[str, str]) -> list[str]:
-    """The metrics among `wanted` that any run has; true costs only if a run did not feel all of them."""
+    """The metrics among `wanted` that any run has; true costs only if a run did not observe all of them."""
 
     def known(name: str) -> bool:
         return any(np.isfinite(run.metrics.get(name, np.nan)).any() for group in shown for run in group.runs)
 
     runs = [run for group in shown for run in group.runs]
-    felt = all(same(run.metrics.get("true_violation_rate"), run.metrics.get("violation_rate")) for run in runs)
-    return [name for name in wanted if known(name) and not (felt and name.startswith("true_"))]
+    observed = all(same(run.metrics.get("true_violation_rate"), run.metrics.get("violation_rate")) for run in runs)
+    return [name for name in wanted if known(name) and not (observed and name.startswith("true_"))]
 
 
 def titles(shown: Sequence[Group]) -> dict[str, str]:
@@ -204,8 +204,8 @@ def _task_panels(part: Any, task: str, shown: Sequence[Group], wide: float) -> N
         axis.set_axis_off()
     part.suptitle(f"{task}: {caption(shown)}", fontsize=9)
     handles = axes[0].get_legend_handles_labels()
-    beside = max(1, min(4, int(wide / _entry(shown))))
-    part.legend(*handles, loc="outside lower center", ncols=beside, frameon=False, fontsize=8)
+    entries = max(1, min(4, int(wide / _entry(shown))))
+    part.legend(*handles, loc="outside lower center", ncols=entries, frameon=False, fontsize=8)
 
 
 def _panel(axis: Any, shown: Sequence[Group], name: str, title: str) -> None:

@@ -68,7 +68,7 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
     """Every point by name: `fear_l2=0,lambda_lr=0.1`, after `draw=3` if drawn, after `task=lane` if there are several.
 
     Args:
-      preset, fixed: as for `load_config`, for all points. Options in a fixed `env` are laid beside those that vary.
+      preset, fixed: as for `load_config`, for all points. Options in a fixed `env` are laid next to those that vary.
 
     Raises:
       UsageError: an unknown setting, a value that does not fit, ranges without draws, a setting that varies and is

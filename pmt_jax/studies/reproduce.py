@@ -1,4 +1,4 @@
-"""`pmt reproduce`: the paper's tables, trained and printed beside the paper's numbers."""
+"""`pmt reproduce`: the paper's tables, trained and printed next to the paper's numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from ..config.methods import METHODS
 from ..errors import UsageError
 from ..tasks import did_you_mean, names
-from ..training.claims import claim
+from ..training import lock
 from . import table
 from .points import Part, Points, make_points
 from .rows import rows
@@ -17,17 +17,21 @@ from .run_log import read_all
 from .sweep import ONE_AT_A_TIME, Launch, check_tasks, missing_programs, train_programs
 
 
-def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it beside the paper's.
+def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
+    """Trains what is missing of a table of the paper, its methods on its tasks, and prints it next to the paper's.
 
     Args:
-      name: a table in paper.toml; budget: one of its budgets; form: of the table, see `table.FORMATS`.
+      name: a table in paper.toml; budget: one of its budgets; layout: of the table, see `table.FORMATS`.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
     """
     paper = table.paper()
-    choices = (("table", name, paper["tables"]), ("budget", budget, paper["budgets"]), ("format", form, table.FORMATS))
+    choices = (
+        ("table", name, paper["tables"]),
+        ("budget", budget, paper["budgets"]),
+        ("format", layout, table.FORMATS),
+    )
     for what, word, known in choices:
         if word not in known:
             raise UsageError(f"unknown {what} '{word}'{did_you_mean(word, known)}")
@@ -40,14 +44,14 @@ def reproduce(name: str, budget: str, out: pathlib.Path, form: str = "text", lau
     check_tasks(next(iter(points.values())) for points in plans.values())
     with contextlib.ExitStack() as stack:
         for task in plans:
-            stack.enter_context(claim(out / task))
+            stack.enter_context(lock.acquire(out / task))
         missing = [missing_programs(points, out / task, launch.say) for task, points in plans.items()]
         code = train_programs([program for programs in missing for program in programs], launch)
     if code:
         return code
     logs = read_all([out / task / point for task, points in plans.items() for point in points])
     launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
-    launch.say(table.render(rows(logs), form, wanted["baseline"]))
+    launch.say(table.render(rows(logs), layout, wanted["baseline"]))
     return 0
 
 

@@ -49,7 +49,7 @@ COLUMNS = (
     Column("cost", "episode_cost", 0, note="cost: undiscounted, of one agent (mean over agents), per episode"),
     Column("worst agent", f"episode_cost{WORST}", 0, note="worst agent: cost of the agent whose is highest"),
     Column("violation rate", "violation_rate", 0, 1, "violation rate: share of steps with a cost for some agent"),
-    Column("true cost", "true_episode_cost", 0, note="true: with the costs that the team did not feel"),
+    Column("true cost", "true_episode_cost", 0, note="true: with the costs that the learner did not observe"),
     Column("true worst agent", f"true_episode_cost{WORST}", 0),
     Column("true violation rate", "true_violation_rate", 0, 1),
     Column("true step cost", "true_step_cost", 0),
@@ -63,15 +63,6 @@ COLUMNS = (
         note="cost beyond: an episode's cost beyond the limit, 0 within it, mean over all of training",
         throughout=True,
     ),
-    # Of runs before 2026-11-27. It depends on `cost_estimate`, and the rate counts what is left of an ended episode.
-    Column(
-        "estimate beyond",
-        "cost_beyond",
-        0,
-        note="estimate beyond: of the cost per episode that the multiplier is updated with, what is beyond the limit, "
-        "mean over all of training",
-        throughout=True,
-    ),
 )
 
 
@@ -83,7 +74,7 @@ def columns(tasks: Iterable[str]) -> list[Column]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class TableRow:
     """The seeds of all runs with the same task, method and settings.
 
     Attributes:
@@ -135,10 +126,10 @@ class Row:
         return (not beyond <= 0, math.inf if math.isnan(key) else key)
 
 
-RowOrGroup = TypeVar("RowOrGroup", Row, Group)
+RowOrGroup = TypeVar("RowOrGroup", TableRow, Group)
 
 
-def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[Row]:
+def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[TableRow]:
     """One row per task, method and settings, in the order of the tasks' names and of METHODS.
 
     Args:
@@ -156,12 +147,12 @@ def in_order(rows: Sequence[RowOrGroup]) -> list[RowOrGroup]:
     return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
 
 
-def _row(group: Group) -> Row:
+def _row(group: Group) -> TableRow:
     first, last = group.runs[0], group.runs[-1]
     if len({run.evaluated for run in group.runs}) > 1:
         raise UsageError(f"{first.folder} and {last.folder} cannot share a row: only one was evaluated in training")
     scores = {c.name: group.score(c.metric, c.throughout) for c in columns([group.task])}
-    return Row(
+    return TableRow(
         task=group.task,
         method=group.method,
         settings=group.settings,
@@ -178,20 +169,20 @@ def _row(group: Group) -> Row:
     )
 
 
-def shown(rows: Sequence[Row]) -> list[Column]:
-    """The columns that any row has, in order; true costs only if a run did not feel all of them."""
+def shown(rows: Sequence[TableRow]) -> list[Column]:
+    """The columns that any row has, in order; true costs only if a run did not observe all of them."""
     every = columns(row.task for row in rows)
     present = [column for column in every if any(column.name in row.scores for row in rows)]
-    felt = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)
-    return [column for column in present if not (felt and column.name.startswith("true "))]
+    observed = all(same(row.scores.get("true cost"), row.scores.get("cost")) for row in rows)
+    return [column for column in present if not (observed and column.name.startswith("true "))]
 
 
-def same(true: np.ndarray | None, felt: np.ndarray | None) -> bool:
-    """Whether true costs are the felt ones, as far as both are known."""
-    return true is None or felt is None or np.array_equal(true, felt, equal_nan=True)
+def same(true: np.ndarray | None, observed: np.ndarray | None) -> bool:
+    """Whether true costs are the observed ones, as far as both are known."""
+    return true is None or observed is None or np.array_equal(true, observed, equal_nan=True)
 
 
-def compared(rows: Sequence[Row]) -> tuple[str, str]:
-    """The columns that rows are compared by: reward, and the cost as it was, felt or not, of the worst agent."""
+def compared(rows: Sequence[TableRow]) -> tuple[str, str]:
+    """The columns that rows are compared by: reward, and the cost as it was, observed or not, of the worst agent."""
     names = [column.name for column in shown(rows)]
     return "reward", next(x for x in ("true worst agent", "true cost", "worst agent", "cost") if x in (*names, "cost"))

@@ -26,7 +26,7 @@ from . import program_folder
 
 LAST = 0.1  # share of the steps that a run's final metrics are averaged over
 NOT_LEARNING = ("seed", "seeds", "log_interval", "eval_interval", "eval_episodes")  # do not change what is learned
-IDENTITY = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
+REQUIRED = {"step": int, "seed": int, "task": str, "method": str, KEY: float}  # what every row says
 TEXT = ("broken",)  # besides
 
 
@@ -103,24 +103,21 @@ class RunLog:
     def excess(self) -> np.ndarray:
         """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest.
 
-        If not all of one cost is felt (`cost_seen`), it is the true cost beyond the limit on true costs. If false ones
-        are felt, too (`cost_false`), it is the cost as felt beyond the limit on that: their expectations agree.
+        If not all of one cost is observed (`cost_seen`), it is the true cost beyond the limit on true costs.
         """
         seen = self.settings.get("cost_seen", 1.0)
-        true = seen < 1 and len(self.limits.each) == 1 and self.true_limits is not None
+        true = seen < 1 and len(self.limits.each) == 1
         if true and "true_episode_cost" in self.metrics:
             return self.limits.true(seen).excess(self._costs("true_episode_cost"))
         return self.limits.excess(self._costs("episode_cost"))
 
     @property
-    def true_limits(self) -> Limits | None:
-        """The limits on true costs, of which the team feels a share; None if it feels false ones, too."""
-        if self.settings.get("cost_false", 0.0):
-            return None  # they depend on the time limit, which a run folder does not say
+    def true_limits(self) -> Limits:
+        """The limits on true costs, of which the learner observes a share."""
         return self.limits.true(self.settings.get("cost_seen", 1.0))
 
-    def limits_on(self, metric: str) -> Limits | None:
-        """The limits on a metric of costs; None if they are unknown."""
+    def limits_on(self, metric: str) -> Limits:
+        """The limits on a metric of costs."""
         return self.true_limits if metric.startswith("true_") else self.limits
 
     def _costs(self, name: str) -> np.ndarray:
@@ -281,7 +278,7 @@ def _config(file: pathlib.Path) -> Config:
 
 def _check(row: dict[str, Any], file: pathlib.Path) -> None:
     """Raises UsageError if a row's identity is missing or of the wrong type."""
-    for name, kind in IDENTITY.items():
+    for name, kind in REQUIRED.items():
         value = row.get(name)
         words = {int: "a whole number", str: "a word", float: "a number"}[kind]
         fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
@@ -300,7 +297,7 @@ def _metrics(
     for row in rows:
         place = seed_at[row["seed"]], step_at[row["step"]]
         for name, value in row.items():
-            if name in IDENTITY or name in TEXT:
+            if name in REQUIRED or name in TEXT:
                 continue
             if name not in found:
                 found[name] = np.full((len(seeds), len(steps)), np.nan)

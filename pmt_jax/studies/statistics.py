@@ -66,15 +66,11 @@ def share_difference_interval(ours: int, of_ours: int, theirs: int, of_theirs: i
 
     Newcombe's tenth method (1998, Statistics in Medicine 17): Wilson's limits of both shares, combined.
     """
-    z = float(scipy.special.ndtri((1 + level) / 2))
-
-    def wilson(count: int, total: int) -> tuple[float, float, float]:
-        share = count / total
-        half = z * math.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
-        middle, scale = share + z**2 / (2 * total), 1 + z**2 / total
-        return share, (middle - half) / scale, (middle + half) / scale
-
-    (p, p_low, p_high), (q, q_low, q_high) = wilson(ours, of_ours), wilson(theirs, of_theirs)
+    p, q = ours / of_ours, theirs / of_theirs
+    (p_low, p_high), (q_low, q_high) = (
+        scipy.stats.binomtest(count, total).proportion_ci(level, "wilson")
+        for count, total in ((ours, of_ours), (theirs, of_theirs))
+    )
     return p - q - math.hypot(p - p_low, q_high - q), p - q + math.hypot(p_high - p, q - q_low)
 
 

@@ -22,11 +22,10 @@ from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
-from ..training import claims, trainer
+from ..training import lock, trainer
 from ..training.checkpoint import Checkpoints, Provenance
-from ..training.claims import claim
 from ..training.run_folder import Rescue, Say, load_saved
-from . import program_folder, table, workers
+from . import jobs, program_folder, table
 from .points import Part, Points, drawn
 from .rows import rows
 from .run_log import read_all
@@ -38,44 +37,24 @@ class Launch(NamedTuple):
     Attributes:
       cache: keep compiled programs on disk.
       say: prints a line.
-      count: of devices, as for `trainer.train`.
-      at_once: programs that train at a time, each in a process of its own where it is more than one.
+      devices: how many, as for `trainer.train`.
+      jobs: programs that train at a time, each in a process of its own where it is more than one.
     """
 
     cache: bool = True
     say: Say = print
-    count: int | None = None
-    at_once: int = 1
+    devices: int | None = None
+    jobs: int = 1
 
 
 ONE_AT_A_TIME = Launch()
 
 
 def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of the `points` of `parts` (see `train_points`) and says which meet the limit best.
+    """Trains what is missing of the `points` of `parts` and says which meet the limit best.
 
-    draws.json holds what was drawn at random.
-    """
-    with claim(out):
-        wanted = missing_programs(points, out, launch.say)
-        if values := drawn(parts, points):
-            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
-            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
-            with writing(out / "draws.json") as partial:
-                partial.write_text(json.dumps(values, indent=1) + "\n")
-        _check_missing(wanted)
-        code = train_programs(wanted, launch)
-    if code == 0:
-        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        found = rows(read_all([out / name for name in points]), launch.say)
-        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
-    return code
-
-
-def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
-    """Trains what is missing of `points`, each into its own folder under `out`.
-
-    Finished points are skipped. Points that were interrupted continue from their last checkpoint, bit for bit.
+    Each point has its own folder in `out`, and draws.json holds what was drawn at random. Finished points are skipped;
+    points that were interrupted continue from their last checkpoint, bit for bit.
 
     Returns:
       The exit code of `trainer.train`: 0 when all points are finished.
@@ -83,16 +62,22 @@ def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TI
     Raises:
       UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
     """
-    with claim(out):
-        programs = missing_programs(points, out, launch.say)
-        _check_missing(programs)
-        return train_programs(programs, launch)
-
-
-def _check_missing(programs: Sequence[Program]) -> None:
-    configs = [config for program in programs for config in program.points.values()]
-    if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
-        check_tasks(configs)
+    with lock.acquire(out):
+        wanted = missing_programs(points, out, launch.say)
+        if values := drawn(parts, points):
+            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
+            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
+            with writing(out / "draws.json") as partial:
+                partial.write_text(json.dumps(values, indent=1) + "\n")
+        configs = [config for program in wanted for config in program.points.values()]
+        if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
+            check_tasks(configs)
+        code = train_programs(wanted, launch)
+    if code == 0:
+        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+        found = rows(read_all([out / name for name in points]), launch.say)
+        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
+    return code
 
 
 def check_tasks(configs: Iterable[Config]) -> None:
@@ -135,26 +120,26 @@ def missing_programs(points: Points, out: pathlib.Path, say: Say) -> list[Progra
     missing = {name: config for name, config in points.items() if not _finished(out / name, config)}
     if len(missing) < len(points):
         say(f"{len(points) - len(missing)} of {len(points)} points are finished already")
-    return [Program(folder, group, out) for folder, group in _groups(points, missing, out)]
+    return [Program(folder, group, out) for folder, group in grouped(points, missing, out)]
 
 
 def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) -> int:
     """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
-    cache, say, count, at_once = launch
+    cache, say, devices, at_a_time = launch
     for program in programs:
         _write_points(program)
     titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
-    if at_once > 1:
+    if at_a_time > 1:
         for title, program in titled:
             say(f"{title}, {program.out.name}: {', '.join(program.points)}")
-        spread = workers.gpus() if count is None else ()  # a number of devices means those, for every program
-        return workers.run([workers.command(p.folder, p.out, cache, count) for p in programs], at_once, say, spread)
+        spread = jobs.gpus() if devices is None else ()  # a number of devices means those, for every program
+        return jobs.run([jobs.command(p.folder, p.out, cache, devices) for p in programs], at_a_time, say, spread)
     for title, program in titled:
-        if not claims.is_held(program.out):
+        if not lock.is_held(program.out):
             say(f"stopped: {program.out} was deleted, renamed or replaced meanwhile; what follows is not trained")
             return 1
         say(title)
-        code = train_program(program.folder, program.out, cache, say, count)
+        code = train_program(program.folder, program.out, cache, say, devices)
         if code:
             return code
     return 0
@@ -181,7 +166,7 @@ def _finished(folder: pathlib.Path, config: Config) -> bool:
     return True
 
 
-def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
+def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
     """What trains together and where: groups begun earlier that are still wanted as they are, then new ones."""
     left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
@@ -200,7 +185,7 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
         yield out / f".group-{number}", group
 
 
-def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
+def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, devices: int | None) -> int:
     """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
     group = program_folder.points(folder)
     if not group:
@@ -216,9 +201,9 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
-    how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare, "rescue": Rescue(out, files)}
-    with claim(folder):
-        code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
+    how = {"cache": cache, "say": say, "devices": devices, "warm_start": warm_start.prepare}
+    with lock.acquire(folder):
+        code = trainer.train(common, folder / "run", resume=begun, trials=trials, rescue=Rescue(out, files), **how)
         if code == 0:
             code = _finish(folder, group, out, say)
     return code
@@ -226,14 +211,14 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
 
 def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) -> int:
     """Cuts a finished group, if its folder is still there; returns the exit code."""
-    if not claims.is_held(folder):
+    if not lock.is_held(folder):
         say(f"stopped: {folder} was deleted, renamed or replaced; its points get no folders in {out}")
         return 1
-    _cut(folder, group, out)
+    cut_points(folder, group, out)
     return 0
 
 
-def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
+def cut_points(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
     rows = program_folder.rows(folder, group)

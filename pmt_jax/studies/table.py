@@ -1,4 +1,4 @@
-"""`pmt table`: method x (reward, cost, violation rate), with intervals over seeds, beside the paper's numbers."""
+"""`pmt table`: method x (reward, cost, violation rate), with intervals over seeds, next to the paper's numbers."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from ..errors import UsageError
 from ..formats import number
 from ..limits import KEY
 from ..tasks import did_you_mean
-from . import compare, statistics
-from .rows import Column, Row, compared, shown
+from . import effects, statistics
+from .rows import Column, TableRow, compared, shown
 
 FORMATS = (*formats.WRITERS, "json")
 
 
-def render(table: Sequence[Row], form: str = "text", baseline: str | None = None, test: bool = False) -> str:
+def render(table: Sequence[TableRow], layout: str = "text", baseline: str | None = None, test: bool = False) -> str:
     """The table with what its numbers mean.
 
     Args:
-      form: text, markdown, latex or json.
+      layout: text, markdown, latex or json.
       baseline: a row's label, or a method with no more than one row per task, that the others are held against.
       test: also print p values.
 
     Raises:
       UsageError: an unknown format or baseline, or a test without a baseline.
     """
-    if form not in FORMATS:
-        raise UsageError(f"unknown format '{form}'{did_you_mean(form, FORMATS)}")
+    if layout not in FORMATS:
+        raise UsageError(f"unknown format '{layout}'{did_you_mean(layout, FORMATS)}")
     if test and not baseline:
         raise UsageError("--test compares with a baseline: name a row with --baseline, like --baseline mappo_l")
     data = summarise(table, baseline)
-    together = compare.overall(table, baseline) if baseline else {}
+    together = effects.overall(table, baseline) if baseline else {}
     notes = _notes(table, data, baseline, test)
-    if form == "json":
+    if layout == "json":
         everything = {"rows": data, "baseline": baseline, "all_tasks": together, "notes": notes}
         return json.dumps(everything, indent=1) + "\n"
     for label, better in together.items():
-        told = ", ".join(f"P({name}) {_interval(found, 'probability')}" for name, found in better.items())
-        notes.append(f"All tasks together, {label}: {told}.")
-    return formats.write(*_cells(table, data, baseline, test), form, notes)
+        listed = ", ".join(f"P({name}) {_interval(found, 'probability')}" for name, found in better.items())
+        notes.append(f"All tasks together, {label}: {listed}.")
+    return formats.write(*_cells(table, data, baseline, test), layout, notes)
 
 
-def cells(table: Sequence[Row]) -> tuple[list[str], list[list[str]], list[str]]:
+def cells(table: Sequence[TableRow]) -> tuple[list[str], list[list[str]], list[str]]:
     """The table without a baseline: its head, its lines, and what its numbers mean."""
     data = summarise(table)
     return *_cells(table, data, None, False), _notes(table, data, None, False)
@@ -64,7 +64,7 @@ def paper() -> dict[str, Any]:
     return tomllib.loads((pathlib.Path(__file__).parent / "paper.toml").read_text())
 
 
-def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[str, Any]]:
+def summarise(table: Sequence[TableRow], baseline: str | None = None) -> list[dict[str, Any]]:
     """Every row as plain data.
 
     Returns:
@@ -75,7 +75,7 @@ def summarise(table: Sequence[Row], baseline: str | None = None) -> list[dict[st
       UsageError: no row, or several of one task, have the baseline's name.
     """
     numbers = paper()["tasks"]
-    comparisons = compare.with_baseline(table, baseline) if baseline else {}
+    comparisons = effects.with_baseline(table, baseline) if baseline else {}
     result = []
     for row in table:
         cost, against = row.score(compared(table)[1]), comparisons.get((row.task, row.label))
@@ -110,12 +110,12 @@ def _finite(x: float) -> float | None:
 
 
 def _cells(
-    table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str | None, test: bool
+    table: Sequence[TableRow], data: Sequence[dict[str, Any]], baseline: str | None, test: bool
 ) -> tuple[list[str], list[list[str]]]:
     columns = [column.name for column in shown(table)]
     reported = {"paper": [row["paper"] for row in data], "rerun": [row["paper"]["rerun"] for row in data]}
     papers = [(who, column) for who in reported for column in columns if any(column in row for row in reported[who])]
-    better = compare.names(compared(table)) if baseline else ()
+    better = effects.names(compared(table)) if baseline else ()
     head = ["task", "method", "seeds", "steps", *columns, "limit", "seeds within", "worst seed"]
     head += [f"P({name})" for name in better] + [f"p ({name})" for name in better if test]
     head += [f"{who} {column}" for who, column in papers]
@@ -140,7 +140,7 @@ def _interval(estimate: dict[str, float | None] | None, middle: str) -> str:
     return f"{number(estimate[middle])} [{ends}]"
 
 
-def _notes(table: Sequence[Row], data: Sequence[dict[str, Any]], baseline: str | None, test: bool) -> list[str]:
+def _notes(table: Sequence[TableRow], data: Sequence[dict[str, Any]], baseline: str | None, test: bool) -> list[str]:
     """What the numbers are, in sentences."""
     sources = {"training": "training episodes (sampled actions)", "evaluation": "evaluation episodes (mean actions)"}
     used = " or, where a run made them, ".join(sources[s] for s in sources if any(row.source == s for row in table))

@@ -17,7 +17,7 @@ import os
 import pathlib
 import tomllib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,8 +36,8 @@ from .history import checkpoint_steps
 
 KEEP = 2
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
-_PROVENANCE = "provenance"  # its name in the npz, beside the paths of arrays
-_ROW = "['row']"  # before the names of what is known of a row that has not ended
+_PROVENANCE = "provenance"  # its name in the npz, next to the paths of arrays
+ROW = "['row']"  # before the names of what is known of a row that has not ended
 _INFO = ".rollout.vector.env.info["  # in the paths of the environments' info
 
 
@@ -131,15 +131,15 @@ class Provenance:
         traced = {"seed": setup.trials.seed, **vars(setup.trials.hyper)}
         return cls(setup.config, {name: np.asarray(x).tolist() for name, x in traced.items()})
 
-    def dumps(self, step: int) -> np.ndarray:
+    def to_bytes(self, step: int) -> np.ndarray:
         """[bytes] uint8, JSON: what is said of the checkpoint after `step`."""
         seeds = self.trials.get("seed") or [self.config.seed + i for i in range(self.config.seeds)]
         said = {"step": step, "seeds": seeds, "settings": to_toml(self.config), "trials": self.trials}
         return np.frombuffer(json.dumps(said).encode(), np.uint8)
 
     @classmethod
-    def loads(cls, data: np.ndarray) -> tuple[int, Provenance]:
-        """The inverse of `dumps`.
+    def from_bytes(cls, data: np.ndarray) -> tuple[int, Provenance]:
+        """The inverse of `to_bytes`.
 
         Raises:
           UsageError: it has settings that this version of pmt-jax does not know.
@@ -178,6 +178,14 @@ class Saved(NamedTuple):
     provenance: Provenance | None
     damaged: list[int]
 
+    def unexplained(self, config: Config, changes: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+        """{setting: 'its value here -> its value in `config`'} of what the run's later `changes` do not explain."""
+        if self.provenance is None:
+            return {}
+        found = self.provenance.differences(Provenance(config))
+        made = {name: x for row in changes if row["step"] >= self.step for name, x in row["changed"].items()}
+        return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
+
 
 def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: bool = False) -> Saved:
     """The newest checkpoint of a run folder that is whole; only the first of several processes may call it.
@@ -193,8 +201,8 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
     damaged, place, steps = [], folder / "checkpoints", checkpoint_steps(folder)
     for step in steps:
         try:
-            packed = _read(place / str(step))
-        except (_Damaged, OSError) as error:
+            packed = read_table(place / str(step))
+        except (Damaged, OSError) as error:
             said = f"the checkpoint after {step:,} steps in {place} cannot be read ({_reason(error)})"
             if to_continue and isinstance(error, OSError):
                 raise UsageError(
@@ -204,7 +212,7 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
             warn(said)
             damaged.append(step)
             continue
-        row = {path[len(_ROW) + 2 : -2]: packed.pop(path) for path in list(packed) if path.startswith(_ROW)}
+        row = {path[len(ROW) + 2 : -2]: packed.pop(path) for path in list(packed) if path.startswith(ROW)}
         return Saved(step, packed, row, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
     if steps:
         raise UsageError(f"no checkpoint in {place} can be read; restore one from a backup or train anew")
@@ -218,7 +226,7 @@ def _provenance(
         warn(f"the checkpoint after {step:,} steps in {place} does not say which run it belongs to")
         return None
     try:
-        written, provenance = Provenance.loads(data)
+        written, provenance = Provenance.from_bytes(data)
     except UsageError as error:
         raise UsageError(f"the checkpoint after {step:,} steps in {place}: {error}") from None
     if written != step:
@@ -276,10 +284,15 @@ class Checkpoints:
         """
         if step in self.steps():
             return
-        self._write(step, pack(tree) | {_PROVENANCE: provenance.dumps(step)})
+        self.write_table(step, pack(tree) | {_PROVENANCE: provenance.to_bytes(step)})
 
     @processes.in_first
-    def _write(self, step: int, table: dict[str, np.ndarray]) -> None:
+    def write_table(self, step: int, table: dict[str, np.ndarray]) -> None:
+        """Writes {path: array} as the checkpoint after `step`.
+
+        Raises:
+          OSError: it cannot be written.
+        """
         data = _to_bytes(table)
         try:
             with _quiet():
@@ -316,16 +329,16 @@ class Checkpoints:
             self._manager.close()
 
 
-class _Damaged(Exception):
+class Damaged(Exception):
     """A checkpoint whose files can be read, but do not hold what was written."""
 
 
-def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
+def read_table(step: pathlib.Path) -> dict[str, np.ndarray]:
     """The table of one checkpoint.
 
     Raises:
       OSError: the disk does not give its files.
-      _Damaged: they are not whole.
+      Damaged: they are not whole.
     """
     try:
         for folder, _, names in os.walk(step, onerror=_raise):  # this fails with the system's reason, orbax does not
@@ -334,14 +347,14 @@ def _read(step: pathlib.Path) -> dict[str, np.ndarray]:
         with _quiet(), ocp.StandardCheckpointer(multiprocessing_options=_alone()) as checkpointer:
             restored: Any = checkpointer.restore((step / "default").absolute())
         if "npz" not in restored:
-            raise _Damaged("it is of another version of pmt-jax")
+            raise Damaged("it is of another version of pmt-jax")
         return _from_bytes(np.asarray(restored["npz"]))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise _Damaged("it is incomplete") from error
-    except (OSError, MemoryError, _Damaged):
+        raise Damaged("it is incomplete") from error
+    except (OSError, MemoryError, Damaged):
         raise
     except Exception as error:  # whatever orbax and tensorstore make of damaged files
-        raise _Damaged(_reason(error)) from error
+        raise Damaged(_reason(error)) from error
 
 
 def _alone() -> ocp.options.MultiprocessingOptions:

@@ -39,14 +39,14 @@ class Programs(NamedTuple):
     Attributes:
       chunk: state, updates -> the state so many updates later, and metrics [seeds, chunks.most(config)], of which the
         first `updates` count, with those of `_health`, [seeds]. Any number up to that runs the same program.
-      take: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
+      where_seed: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
       evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       measures: the names of these metrics.
-      close: ends what runs beside this process for them.
+      close: ends what runs next to this process for them.
     """
 
     chunk: Callable[[LearnerState, int], tuple[LearnerState, Metrics]]
-    take: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
+    where_seed: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
     evaluate: Callable[[LearnerState], Metrics] | None = None
     measures: tuple[str, ...] = ()
     close: Callable[[], object] = lambda: None
@@ -74,7 +74,7 @@ def check_memory(setup: Setup) -> None:
       UsageError: names what is too large.
     """
     config, spec = setup.config, setup.vector.spec
-    memory = _device_memory() * (setup.mesh.size if setup.mesh else 1)
+    memory = device_memory() * (setup.mesh.size if setup.mesh else 1)
     batch = config.batch_size * (spec.num_agents * spec.obs_dim + spec.state_dim)
     widths = (spec.obs_dim, *config.hidden, spec.action_dim)
     networks = 3 * spec.num_agents * sum(x * y for x, y in itertools.pairwise(widths))
@@ -90,7 +90,7 @@ def check_memory(setup: Setup) -> None:
             )
 
 
-def _device_memory() -> float:
+def device_memory() -> float:
     """Bytes of one device, or of the machine if devices share its memory."""
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in stats or not hasattr(os, "sysconf"):  # Windows has none
@@ -133,7 +133,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
     placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys))
     everywhere = sharding.replicated(setup.mesh)
-    state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(_options(once=True))(hyper, keys)
+    state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(xla_options(once=True))(hyper, keys)
 
     def chunk(hyper: Any, state: LearnerState, updates: jax.Array) -> tuple[LearnerState, Metrics]:
         state, metrics = learner.train_some(setup, hyper, state, updates, chunks.most(config))
@@ -143,13 +143,13 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     program = jax.jit(_over_seeds(setup, chunk, (*axes, None)), out_shardings=(placement, everywhere))
     with sharding.use_mesh(setup.mesh), cache_events() as events:
         one = np.int32(1)
-        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(_options())
-    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(take, donate_argnums=1))
+        compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(xla_options())
+    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(where_seed, donate_argnums=1))
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
         with sharding.use_mesh(setup.mesh):
-            evaluation = program.lower(state).compile(_options())
+            evaluation = program.lower(state).compile(xla_options())
         programs = programs._replace(evaluate=evaluation, measures=tuple(evaluation.out_info))
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     return state, programs, found
@@ -161,7 +161,7 @@ def _run_chunk(
     return program(hyper, state, np.int32(updates))
 
 
-def _options(once: bool = False) -> dict[str, str | bool] | None:
+def xla_options(once: bool = False) -> dict[str, str | bool] | None:
     """XLA's options for a run's programs, and for what runs `once`. Whoever sets a level in XLA_FLAGS gets that.
 
     On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
@@ -179,10 +179,10 @@ def _options(once: bool = False) -> dict[str, str | bool] | None:
     return None if option in os.environ.get("XLA_FLAGS", "") else {option: level}
 
 
-def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
+def _kernels(setup: Setup, say: Say) -> Sequence[Callable[[], Any]]:
     """What the physics needs besides XLA's programs."""
     try:
-        return tasks.kernels(setup.vector.env)
+        return tasks.declarations(setup.vector.env).kernels()
     except Exception as error:  # found through private places of Warp; without them it compiles as it goes
         say(f"the first update compiles the physics' kernels: {error}")
         return []
@@ -190,7 +190,7 @@ def _kernels(setup: Setup, say: Say) -> list[Callable[[], Any]]:
 
 @contextlib.contextmanager
 def compiling(kernels: Sequence[Callable[[], Any]], say: Say) -> Iterator[None]:
-    """Compiles the physics' kernels on threads beside what is done inside, and waits for them at its end.
+    """Compiles the physics' kernels on threads while the block runs, and waits for them at its end.
 
     One that cannot be compiled raises when it is first launched.
     """
@@ -246,6 +246,6 @@ def _over_seeds(setup: Setup, function: Callable[..., Any], axes: Any) -> Callab
     return jax.vmap(function, axes, axis_name=axis_name, spmd_axis_name=sharding.SEED if setup.mesh else None)
 
 
-def take(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
+def where_seed(chosen: jax.Array, old: LearnerState, new: LearnerState) -> LearnerState:
     """See `Programs`."""
     return jax.vmap(lambda yes, x, y: jax.tree.map(functools.partial(jnp.where, yes), y, x))(chosen, old, new)

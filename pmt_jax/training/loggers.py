@@ -36,10 +36,10 @@ def check_loggers(names: Sequence[str]) -> None:
     """
     for name in names:
         if name not in NEEDS:
-            raise UsageError(f"unknown sink '{name}'{did_you_mean(name, NEEDS)}")
+            raise UsageError(f"unknown logger '{name}'{did_you_mean(name, NEEDS)}")
         package = NEEDS[name]
         if package and importlib.util.find_spec(package) is None:
-            raise UsageError(f"sink '{name}' needs {package}; install it with pip install 'pmt-jax[log]'")
+            raise UsageError(f"logger '{name}' needs {package}; install it with pip install 'pmt-jax[log]'")
     if "wandb" in names:
         _check_wandb_key()
 
@@ -49,7 +49,8 @@ def _check_wandb_key() -> None:
         return
     if not importlib.import_module("wandb").api.api_key:
         raise UsageError(
-            "sink 'wandb' has no key; run wandb login, set WANDB_API_KEY, or set WANDB_MODE=offline to log without one"
+            "logger 'wandb' has no key; run wandb login, set WANDB_API_KEY, or set WANDB_MODE=offline to log without "
+            "one"
         )
 
 
@@ -160,7 +161,7 @@ class Wandb:
         try:
             self._run = wandb.init(**identity, resume="allow", config=settings)
         except wandb.errors.Error as error:
-            raise UsageError(f"sink 'wandb' cannot start: {str(error).splitlines()[0]}") from error
+            raise UsageError(f"logger 'wandb' cannot start: {str(error).splitlines()[0]}") from error
 
     def write(self, rows: list[Row]) -> None:
         metrics = {f"seed{row['seed']}/{name}": x for row in rows for name, x in _numbers(row).items()}

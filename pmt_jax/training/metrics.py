@@ -62,9 +62,7 @@ METRICS: dict[str, Metric] = {
     ),
     "step_reward": Metric("reward", "reward of a control step"),
     "step_cost": Metric("cost", "cost of a control step, mean over agents"),
-    "true_episode_cost": Metric(
-        "cost", "episode_cost before `cost_seen` and `cost_false`: what the costs were", "episodes"
-    ),
+    "true_episode_cost": Metric("cost", "episode_cost before `cost_seen`: what the costs were", "episodes"),
     "true_episode_cost_worst": Metric("cost", "the same of the agent whose cost is highest"),
     "true_violation_rate": Metric("", "violation_rate of what the costs were"),
     "true_step_cost": Metric("cost", "step_cost of what the costs were"),

@@ -78,8 +78,8 @@ class Progress:
         with dropped_if_closed():
             self._print(cells, last=step >= self._total)
 
-    def _number(self, name: str, form: str) -> str:
-        return format(self._latest[name], form) if name in self._latest else "-"
+    def _number(self, name: str, spec: str) -> str:
+        return format(self._latest[name], spec) if name in self._latest else "-"
 
     def _cost(self) -> str:
         """The mean over agents; where they do not share costs, also what is held against the limit."""

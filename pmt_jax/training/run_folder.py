@@ -16,11 +16,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import numerics
 from ..config.load import load_config, to_toml
-from ..config.settings import Config
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import learner
@@ -28,14 +26,14 @@ from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from . import claims, processes
+from . import lock, processes
 from .checkpoint import Checkpoints, Provenance, Saved, check_name, newest, unpack
 from .history import Row, checkpoint_steps, missing_rows, read_changes
 from .loggers import Jsonl, Logger, open_loggers
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 # What --change keeps: who the run is, and what is read at its start only.
-IDENTITY = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
+FIXED = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
@@ -45,7 +43,7 @@ class Rescue:
     """Where a run is saved whose folder is gone.
 
     Attributes:
-      of: the run folder or the sweep's; the place is beside it, `OF-rescued`.
+      of: the run folder or the sweep's; the place is next to it, `OF-rescued`.
       files: {path below that: text} of what it needs besides the run's own files.
     """
 
@@ -54,7 +52,7 @@ class Rescue:
 
 
 class RunFolder:
-    """The folder of a run that trains here: its claim, settings, versions, rows and the place of its checkpoints.
+    """The folder of a run that trains here: its lock, settings, versions, rows and the place of its checkpoints.
 
     The first process reads and writes. All others must call the same methods at the same points, and get its results;
     if it fails, they end with its exit code.
@@ -66,21 +64,21 @@ class RunFolder:
     """
 
     def __init__(self, setup: Setup, say: Say, rescue: Rescue | None = None) -> None:
-        """A folder for a run of `setup`, which `claim` gives a place; `rescue` is beside that place if None."""
+        """A folder for a run of `setup`, which `acquire` gives a path; `rescue` is next to that path if None."""
         self.path, self.saved = pathlib.Path(), None
         self._setup, self._say, self._rescue = setup, say, rescue
         self._provenance = self._run = Provenance.of(setup)
         self._changes: list[Row] = []
         self._is_edited = False
         self._loggers: list[Logger] = []
-        self._claim, self._open = contextlib.ExitStack(), contextlib.ExitStack()
+        self._lock, self._open = contextlib.ExitStack(), contextlib.ExitStack()
 
-    def claim(self, out: pathlib.Path | None, resume: bool, change: bool = False) -> None:
+    def acquire(self, out: pathlib.Path | None, resume: bool, change: bool = False) -> None:
         """Takes the folder `out`, or a new one if None, until `close`.
 
         Args:
           resume: it holds a run to continue, which `saved` is then of; otherwise it must hold none.
-          change: the settings may differ from that run's, all but `IDENTITY`.
+          change: the settings may differ from that run's, all but `FIXED`.
 
         Raises:
           UsageError: another process has it, it holds something else, or the run was made with other settings, on
@@ -93,7 +91,7 @@ class RunFolder:
     def _take(self, out: pathlib.Path | None, resume: bool, change: bool) -> tuple[pathlib.Path, Saved | None]:
         self.path = out or create(self._setup)
         _check_path(self.path, resume)
-        self._claim.enter_context(claims.claim(self.path, created=out is None))
+        self._lock.enter_context(lock.acquire(self.path, created=out is None))
         self._home = self.path.absolute()  # the working folder may be renamed
         rescue = self._rescue or Rescue(self.path)
         self._rescue = dataclasses.replace(rescue, of=rescue.of.absolute())
@@ -105,7 +103,7 @@ class RunFolder:
         Raises:
           OSError: what was written last does not fit on the disk.
         """
-        with self._claim:
+        with self._lock:
             self._open.close()
 
     def _check_content(self, resume: bool, change: bool) -> Saved | None:
@@ -118,22 +116,22 @@ class RunFolder:
                     f"{self.path} already holds {what}; choose another --out, or --resume to continue the run"
                 )
             return None
-        self._changes = read_changes(self.path)
         saved = newest(self.path, self._say, to_continue=True) if checkpoint_steps(self.path) else None
+        self._changes = read_changes(self.path)
         self._same_settings(saved, change)
         self._same_machine()
         return saved
 
     def _same_settings(self, saved: Saved | None, change: bool) -> None:
-        """Only `steps` may change when a run is continued; with `change` all settings but IDENTITY."""
+        """Only `steps` may change when a run is continued; with `change` all settings but FIXED."""
         file = self.path / "config.toml"
         self._run, edited = Provenance(load_config(file)), {}
         if saved and saved.provenance:
-            edited = unexplained(saved, self._run.config, self._changes)
+            edited = saved.unexplained(self._run.config, self._changes)
             config = saved.provenance.config if edited else self._run.config
             self._run = Provenance(config, saved.provenance.trials)
         changed = self._run.differences(self._provenance)
-        refused = {name: x for name, x in changed.items() if name in IDENTITY or not change}
+        refused = {name: x for name, x in changed.items() if name in FIXED or not change}
         self._is_edited = bool(edited)
         if edited and not changed:
             self._say(
@@ -174,17 +172,17 @@ class RunFolder:
     # Writing
 
     def check(self) -> None:
-        """Whether the folder is still the one that was claimed, which must be so before anything is written.
+        """Whether the folder is still the one that was locked, which must be so before anything is written.
 
         Raises:
           Gone: it, or the file of its rows, was deleted, renamed or replaced.
         """
         if gone := self._gone():
-            raise claims.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
+            raise lock.Gone(f"{gone} was deleted, renamed or replaced while the run trained")
 
     @processes.in_first
     def _gone(self) -> pathlib.Path | None:
-        if not claims.is_held(self.path):
+        if not lock.is_held(self.path):
             return self.path
         whole = all(logger.is_there for logger in self._loggers if isinstance(logger, Jsonl))
         return None if whole else self.path / "metrics.jsonl"
@@ -270,13 +268,13 @@ class RunFolder:
         """Writes a checkpoint, as `Checkpoints.save`.
 
         Raises:
-          Gone: the folder is no longer the one that was claimed.
+          Gone: the folder is no longer the one that was locked.
         """
         self.check()
         self.checkpoints.save(step, tree, self._provenance)
 
     def rescue(self, step: int, tree: Any) -> pathlib.Path:
-        """Saves the run in a new folder beside the one that is gone, whole but for older checkpoints.
+        """Saves the run in a new folder next to the one that is gone, whole but for older checkpoints.
 
         Returns:
           its path.
@@ -324,7 +322,7 @@ def create(setup: Setup) -> pathlib.Path:
 
 
 def _check_path(out: pathlib.Path, resume: bool) -> None:
-    """Whether `out` can be a run's folder, as far as that can be said before it is claimed.
+    """Whether `out` can be a run's folder, as far as that can be said before it is locked.
 
     Raises:
       UsageError: it is a file, has a name that cannot be encoded, or holds no run to resume.
@@ -348,7 +346,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     """What the results of a run depend on besides its settings."""
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
-    found |= {"devices": setup.mesh.size if setup.mesh else 1, "jobs": setup.jobs}
+    found |= {"devices": setup.mesh.size if setup.mesh else 1, "workers": setup.workers}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 
@@ -408,12 +406,6 @@ def state_like(setup: Setup) -> LearnerState:
     return jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), (None, 0)), setup.hyper, keys)
 
 
-def initial_best(state: LearnerState) -> Best:
-    """Before anything is known of a run of any number of seeds."""
-    nothing = np.full(state.update.shape, np.inf, np.float32)
-    return Best(_copy(state), -nothing, nothing)
-
-
 def _what_it_is(folder: pathlib.Path) -> str:
     """Of a path that holds no run: why, and what to name instead."""
     if folder.is_file():
@@ -422,11 +414,6 @@ def _what_it_is(folder: pathlib.Path) -> str:
         return "there is no such folder"
     runs = sorted(str(file.parent) for file in folder.glob("*/config.toml"))
     return f"it holds {len(runs)} run(s); name one, as {runs[0]}" if runs else "it has no config.toml"
-
-
-@jax.jit
-def _copy(state: LearnerState) -> LearnerState:
-    return jax.tree.map(jnp.copy, state)  # in one program: a copy of each array would compile one for each shape
 
 
 def load_saved(
@@ -444,26 +431,17 @@ def load_saved(
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     saved = _newest(folder, warn)
-    if edited := unexplained(saved, config, read_changes(folder)):
+    if edited := saved.unexplained(config, read_changes(folder)):
         raise UsageError(
             f"{folder / 'config.toml'} does not say what the checkpoint after {saved.step:,} steps was trained with; "
             f"mend that file, or move the checkpoint elsewhere if it is of another run:{listed(edited)}"
         )
     with numerics.keys_of(recorded_versions(folder) or {}):
         like = state_like(setup)
-        return setup, saved.step, unpack(saved.packed, {"last": like, "best": jax.eval_shape(initial_best, like)})
+        return setup, saved.step, unpack(saved.packed, {"last": like, "best": jax.eval_shape(Best.initial, like)})
 
 
 _newest = processes.in_first(newest)
-
-
-def unexplained(saved: Saved, config: Config, changes: Sequence[Row]) -> dict[str, str]:
-    """{setting: 'its value in the checkpoint -> its value in `config`'} of what `changes` after it do not explain."""
-    if saved.provenance is None:
-        return {}
-    found = saved.provenance.differences(Provenance(config))
-    made = {name: x for row in changes if row["step"] >= saved.step for name, x in row["changed"].items()}
-    return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
 
 
 def listed(changed: Mapping[str, str]) -> str:

@@ -92,10 +92,11 @@ class Interrupts:
         while data := pipe.recv(1):
             number = data[0]
             if number in CAUGHT:
-                self._answer(number, at_once=self._rescue is None or (interrupted and number == signal.SIGINT))
+                self.answer(number, at_once=self._rescue is None or (interrupted and number == signal.SIGINT))
             interrupted |= number == signal.SIGINT
 
-    def _answer(self, number: int, at_once: bool) -> None:
+    def answer(self, number: int, at_once: bool) -> None:
+        """Lets training save and end, or ends this process `at_once`."""
         if not at_once:
             self._say("interrupted: saving after the running chunk; Ctrl-C again ends at once, without saving")
             timer = threading.Timer(PATIENCE, self._give_up, [number])

@@ -28,14 +28,15 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import chunks, claims, failures, health, jobs, processes
+from . import chunks, failures, health, lock, processes
 from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, duration
-from .run_folder import MATMUL_PRECISION, Rescue, RunFolder, initial_best
+from .run_folder import MATMUL_PRECISION, Rescue, RunFolder
 from .signals import Interrupts
+from .workers import WorkerLost, check_workers, start_workers
 
 CHECKPOINT_SECONDS = 300.0
 WarmStart = Callable[[Setup], Callable[[LearnerState], LearnerState] | None]
@@ -52,7 +53,7 @@ def train(
     profile: pathlib.Path | None = None,
     say: Say = say,
     trials: Trials | None = None,
-    count: int | None = None,
+    devices: int | None = None,
     workers: int = 1,
     warm_start: WarmStart = lambda setup: None,
     debug: bool = False,
@@ -68,13 +69,13 @@ def train(
       loggers: where the rows are written besides metrics.jsonl: csv, tensorboard, wandb.
       profile: a folder for a JAX profiler trace of a few chunks.
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
-      count: of devices to split the run over, of all processes together: one if None, or all of several processes'.
+      devices: how many to split the run over, of all processes together: one if None, or all of several processes'.
         Of these, the first writes and prints, and all return the same.
-      workers: processes that share the seeds and the CPUs (see jobs.py).
+      workers: processes that share the seeds and the CPUs (see workers.py).
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
-      rescue: where the run is saved if its folder is gone; beside it if None.
+      rescue: where the run is saved if its folder is gone; next to it if None.
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
@@ -85,17 +86,17 @@ def train(
     """
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     check_loggers(loggers)
-    jobs.check(config, workers, {"--devices": count, "--debug": debug, "--profile": profile})
+    check_workers(config, workers, {"--devices": devices, "--debug": debug, "--profile": profile})
     if not processes.is_first():
         say, loggers, profile = silent, (), None
     if profile is not None:
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
-        interrupts = stack.enter_context(Interrupts(say, claims.release_all))
+        interrupts = stack.enter_context(Interrupts(say, lock.release_all))
         with tasks.announcing(say):
-            setup = dataclasses.replace(_make_setup(config, trials, count, debug), jobs=workers)
+            setup = dataclasses.replace(_make_setup(config, trials, devices, debug), workers=workers)
         folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
-        folder.claim(out, resume, change)
+        folder.acquire(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
         _describe(setup, folder.path, say)
         state, programs = _compile(setup, cache, say)
@@ -109,16 +110,16 @@ def _compile(setup: Setup, cache: bool, say: Say) -> tuple[LearnerState, Program
     if cache:
         use_cache()
     with failures.named():
-        return (jobs.start if setup.jobs > 1 else compile_run)(setup, say)
+        return (start_workers if setup.workers > 1 else compile_run)(setup, say)
 
 
-def _make_setup(config: Config, trials: Trials | None, count: int | None, debug: bool) -> Setup:
+def _make_setup(config: Config, trials: Trials | None, devices: int | None, debug: bool) -> Setup:
     """The run's setup.
 
     Raises:
       UsageError: `debug` on several devices, or more memory than there is.
     """
-    mesh = sharding.make_mesh(config, count)
+    mesh = sharding.make_mesh(config, devices)
     if debug and mesh:
         raise UsageError("--debug runs on one device in one process; leave out --devices")
     setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
@@ -132,13 +133,13 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
         begin()
         trainer.train(interrupts)
         stack.close()
-    except claims.Gone as gone:
+    except lock.Gone as gone:
         trainer.say(trainer.rescue(gone))
         return 1
     except NotFinite as found:
         trainer.say(f"stopped: {found}; saved as of step {trainer.step:,}")
         return 1
-    except (failures.Failed, jobs.Lost) as failure:
+    except (failures.Failed, WorkerLost) as failure:
         trainer.say(f"stopped: {failure}; {trainer.saved}. Continue with: {trainer.command}")
         return 1
     except OSError as error:
@@ -168,8 +169,8 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
             f"{setup.mesh.size} devices in {jax.process_count()} process(es): seeds in {seeds} part(s), "
             f"each seed's environments in {environments}"
         )
-    if setup.jobs > 1:
-        say(f"{setup.jobs} worker processes share the seeds and the CPUs")
+    if setup.workers > 1:
+        say(f"{setup.workers} worker processes share the seeds and the CPUs")
     say(
         f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
         f"{config.num_updates:,} updates = {steps:,} steps a seed"
@@ -191,7 +192,7 @@ class Trainer:
     ) -> None:
         """Begins at the first `state`; `open` may replace it by a saved one."""
         self.setup, self.config, self.programs, self.folder, self.say = setup, setup.config, programs, folder, say
-        self.state, self.best = state, initial_best(state)
+        self.state, self.best = state, Best.initial(state)
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
         self.faults: collections.Counter[str] = collections.Counter()
@@ -256,8 +257,8 @@ class Trainer:
             self._before = self.state, self.step, self._row, self._row_start, dict(self.broken)
             try:
                 with failures.named(), self._others_may_save():
-                    rows = self._train_chunk()
-                    self._evaluate(rows)
+                    rows = self.train_chunk()
+                    self.evaluate(rows)
             except BaseException as error:
                 self._go_back()
                 self._save_before(error)
@@ -265,12 +266,12 @@ class Trainer:
             self.seconds = before + time.monotonic() - begin
             if rows:
                 self._log(rows)
-                self._keep_best(rows)
+                self.keep_best(rows)
             self.folder.check()
             if processes.agree(time.monotonic() - saved > CHECKPOINT_SECONDS):
-                self._save()
+                self.save()
                 saved = time.monotonic()
-        self._save()
+        self.save()
 
     @contextlib.contextmanager
     def _others_may_save(self) -> Iterator[None]:
@@ -293,8 +294,8 @@ class Trainer:
         self._go_back()
         try:
             with contextlib.suppress(jax.errors.JaxRuntimeError):
-                self._save()
-        except claims.Gone as gone:
+                self.save()
+        except lock.Gone as gone:
             return self.rescue(gone)
         except OSError as error:
             return self.write_failure(error)
@@ -310,7 +311,7 @@ class Trainer:
         self._signal = processes.agree(interrupts.received[0] if interrupts.received else 0)
         return self._signal > 0
 
-    def _train_chunk(self) -> list[Row]:
+    def train_chunk(self) -> list[Row]:
         """Trains all seeds for some updates; the rows, if one ends with them.
 
         Seeds that break stay where they were when the row began.
@@ -327,7 +328,9 @@ class Trainer:
             rows = self._end_row()
         if self.broken:
             broken = np.array([i in self.broken for i in range(self.config.seeds)])
-            state = self.programs.take(broken, state, self._row_start)  # which stays whole: `train` may go back to it
+            state = self.programs.where_seed(
+                broken, state, self._row_start
+            )  # which stays whole: `train` may go back to it
         self.state = state
         if rows:
             self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, self._row.updates
@@ -350,7 +353,7 @@ class Trainer:
                 self.broken[i] = reason
         return rows
 
-    def _evaluate(self, rows: list[Row]) -> None:
+    def evaluate(self, rows: list[Row]) -> None:
         """Adds the columns of an evaluation, nan if none is due."""
         if self.programs.evaluate is None or not rows:
             return
@@ -373,7 +376,7 @@ class Trainer:
             assert self._speed is not None  # a chunk has ended
             self._progress.show(rows, self.config.seeds * self.config.batch_size / self._speed)
 
-    def _keep_best(self, rows: list[Row]) -> None:
+    def keep_best(self, rows: list[Row]) -> None:
         """Keeps each seed's state if it is the best so far, by the evaluation if there is one, else by training."""
         prefix = "eval/" if self.config.eval_interval else ""
         whole = [not row["broken"] for row in rows]
@@ -383,7 +386,7 @@ class Trainer:
         best_reward, best_cost = np.asarray(self.best.reward), np.asarray(self.best.cost)
         improved = is_better(reward, cost, best_reward, best_cost, limit)
         if improved.any():
-            state = self.programs.take(improved, self.best.state, self.state)
+            state = self.programs.where_seed(improved, self.best.state, self.state)
             self.best = Best(state, np.where(improved, reward, best_reward), np.where(improved, cost, best_cost))
 
     @property
@@ -392,11 +395,12 @@ class Trainer:
         state = self.state
         lost = ~np.asarray(self._row.metrics.get("finite", np.ones(self.config.seeds, bool)))
         if lost.any():  # the end of the row will say why
-            state = self.programs.take(lost, jax.tree.map(jnp.copy, state), self._row_start)
+            state = self.programs.where_seed(lost, jax.tree.map(jnp.copy, state), self._row_start)
         row = dict(self._row.metrics) | {"seconds": np.full(self.config.seeds, self.seconds)}
         return {"last": state, "best": self.best, "row": row}
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Writes a checkpoint after the step that training has reached."""
         self.folder.save(self.step, self._tree)
 
     def _save_before(self, error: BaseException) -> None:
@@ -404,7 +408,7 @@ class Trainer:
         if not isinstance(error, Exception) or jax.process_count() > 1:  # others would wait for this one for ever
             return
         with contextlib.suppress(jax.errors.JaxRuntimeError):
-            self._save()
+            self.save()
 
     @property
     def saved(self) -> str:
@@ -448,14 +452,16 @@ class Trainer:
             where = self.folder.path
             self.say(f"seed(s) {seeds} broke; the last finite state and the best of every seed are saved in {where}")
 
-    def rescue(self, gone: claims.Gone) -> str:
-        """Saves a run beside its folder that is gone; returns what happened and how to continue."""
+    def rescue(self, gone: lock.Gone) -> str:
+        """Saves a run next to its folder that is gone; returns what happened and how to continue."""
         if not self._is_open:
             return f"stopped: {gone}; nothing new was trained yet"
         try:
             saved = self.folder.rescue(self.step, self._tree)
         except OSError as error:
-            return f"stopped: {gone}; what was trained is lost, as no folder beside it can be written: {error.strerror}"
+            return (
+                f"stopped: {gone}; what was trained is lost, as no folder next to it can be written: {error.strerror}"
+            )
         return f"stopped: {gone}; saved as of step {self.step:,} in {saved}. Continue with: {self._continuing(saved)}"
 
     def write_failure(self, error: OSError) -> str:
@@ -478,5 +484,5 @@ class Trainer:
         if jax.process_count() > 1:
             return "the same command with --resume" + f" --out {shlex.quote(str(out))}" * moved
         split = f" --devices {self.setup.mesh.size}" if self.setup.mesh else ""
-        split += f" --jobs {self.setup.jobs}" if self.setup.jobs > 1 else ""
+        split += f" --workers {self.setup.workers}" if self.setup.workers > 1 else ""
         return load.resume_command(str(out)) + split

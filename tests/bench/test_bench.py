@@ -22,7 +22,7 @@ import envs
 from bench import compare, measure, once, plain, records, render, runner, substep
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
-from bench.forms import pages, runs, tables
+from bench.tables import pages, runs, speed, values
 from docs.figures import ant_paths, curves, episode_cost, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError
@@ -68,7 +68,7 @@ def test_one_that_fails_does_not_stop_the_others(
 ):
     out = fakes("first", "failing", "last")
     old = report() | {"machine": {}, "rows": [{"task": "lane", "steps_per_second": 200}]}
-    monkeypatch.setattr(runner, "_committed", lambda say: {"last": old})
+    monkeypatch.setattr(runner, "last_results", lambda say: {"last": old})
     assert main(["run", "--out", str(out)]) == 1
     assert sorted(path.name for path in out.iterdir()) == ["failing.json.unfinished", "first.json", "last.json"]
     said = capsys.readouterr().out
@@ -141,7 +141,7 @@ def test_programs_take_turns_and_failures_are_rows(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.full
 def test_workers_share_seeds_and_cpus():
-    case = Case("training", "lane", method="mappo_l", seeds=2, num_envs=4, rollout_length=5, jobs=2)
+    case = Case("training", "lane", method="mappo_l", seeds=2, num_envs=4, rollout_length=5, workers=2)
     program = measure.training(case)()
     assert program.steps == 2 * 4 * 5
     for _ in range(2):
@@ -214,19 +214,19 @@ def test_rows_about_the_same_thing_stay_apart():
 
 
 def test_ratios_between_rows_are_taken_turn_by_turn():
-    def row(kind: str, rates: list[float], **more: Any) -> records.Row:
+    def row(kind: str, rates: list[float], **more: Any) -> records.Record:
         return {"kind": kind, "task": "x", "steps_per_second": float(np.median(rates)), "rates": rates, **more}
 
     loops = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]
     alone = row("environment", [160, 90, 170], num_envs=8, physics="mujoco")  # the machine was busy in the second turn
-    shown = tables.COLUMNS["of plain loop x threads"](alone, [*loops, alone])
+    shown = speed.COLUMNS["of plain loop x threads"](alone, [*loops, alone])
     assert shown == "0.85"  # the median of 0.8, 0.9 and 0.85
     one, five = ({"kind": "training", "task": "x", "seeds": n, "steps_per_second": 100.0 * n / 2} for n in (1, 5))
-    assert tables.COLUMNS["x one seed"](five, [one, five]) == "1.00"
-    assert tables.COLUMNS["x one seed"](one, [one, five]) == "-"
+    assert speed.COLUMNS["x one seed"](five, [one, five]) == "1.00"
+    assert speed.COLUMNS["x one seed"](one, [one, five]) == "-"
     locked = loops[1] | {"steps_per_cpu_second": 125}  # that waited for each other
-    assert tables.COLUMNS["of a plain loop on each core"](five, [locked, five]) == "1.00"
-    assert tables.COLUMNS["of a plain loop on each core"](five, [five]) == "-"
+    assert speed.COLUMNS["of a plain loop on each core"](five, [locked, five]) == "1.00"
+    assert speed.COLUMNS["of a plain loop on each core"](five, [five]) == "-"
 
 
 def test_a_table_for_each_device_and_a_failure_in_it():
@@ -236,10 +236,10 @@ def test_a_table_for_each_device_and_a_failure_in_it():
         "engines_h200": head | {"rows": [row | {"steps_per_second": 4321.0, "compile_seconds": 2.52}]},
         "engines_b200": head | {"rows": [row | {"failed": "OutOfMemory: too much"}]},
     }
-    said = tables.TABLES["engines"](reports)
+    said = speed.TABLES["engines"](reports)
     assert "1 x NVIDIA H200, jax 1:" in said and "| ant_2x4 | `warp` | 1 x 16,384 | 4,321 | 2.5 |" in said
     assert "| ant_2x4 | `warp` | 1 x 16,384 | failed: OutOfMemory | - |" in said
-    assert tables.TABLES["engines"]({}) == tables.NOT_YET
+    assert speed.TABLES["engines"]({}) == speed.NOT_YET
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def test_every_result_is_used_by_a_page_or_a_test():
     pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))]
     shown = {name for text in pages for _, name, _, _ in render.BLOCK.findall(text)}
     blocks = {name.partition(":")[2] or name for name in shown}
-    benches = {tables.TABLES[name].result for name in blocks if isinstance(tables.TABLES.get(name), tables.Table)}
+    benches = {speed.TABLES[name].result for name in blocks if isinstance(speed.TABLES.get(name), speed.Table)}
     elsewhere = {
         "ant_paths",
         "ant_paths_methods",
@@ -297,8 +297,27 @@ def test_rendering_replaces_blocks_and_nothing_else():
             render.render(broken, reports)
 
 
+def test_rendering_fills_numbers_in_sentences():
+    mark = "within:limits_macpo_recovery_h200:macpo:{}"
+    text = f"kept by <!-- bench: {mark.format('0.2:limit_windup=inf')} -->3<!-- /bench --> of 20"
+    assert "-->17<!-- /bench --> of 20" in render.render(text, {})
+    assert (
+        values.number(mark.format("*")) == "72" and values.number(mark.format("1").replace("within", "seeds")) == "20"
+    )
+    both = "within:velocity_ant_2x4_limit_5_h200+velocity_half_cheetah_2x3_limit_5_h200:r4sg+macpo:5"
+    assert values.number(both) == "17" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
+    for wrong, said in (
+        (mark.format("7"), "no run of limits_macpo_recovery_h200 is 'macpo:7'"),
+        ("withn:x:*:1", "unknown value 'withn'; did you mean 'within'?"),
+        ("within:x:*:1", "holds no stored runs"),
+        ("within:x", "expected within:FILE:METHOD:LIMIT"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(said)):
+            render.render(f"<!-- bench: {wrong} -->3<!-- /bench -->", {})
+
+
 def test_pages_describe_what_there_is():
-    for form, name, said in (
+    for kind, name, said in (
         ("observation", "lane", "| 1 to 4 | last action | - | of all agents, after clipping |"),
         ("actions", "velocity_swimmer_2x1", "| `velocity_swimmer_2x1` | 1 | 0 motor2_rot |"),
         ("options", "velocity_swimmer_2x1", "| `fall_cost` | `false` | adds a second cost"),
@@ -306,10 +325,10 @@ def test_pages_describe_what_there_is():
         ("settings", "fear_time", "| `fear_time` | `next` | `next`, `current` | fear of the state"),
         ("switches", "all", "| `f4sg` | sequential, an actor each | lagrangian | fear | none |"),
     ):
-        assert said in pages.FORMS[form](name)
-    for form, name in (("observation", "lan"), ("settings", "fear_tim")):
+        assert said in pages.KINDS[kind](name)
+    for kind, name in (("observation", "lan"), ("settings", "fear_tim")):
         with pytest.raises(UsageError, match="did you mean"):
-            pages.FORMS[form](name)
+            pages.KINDS[kind](name)
 
 
 def test_names_beside_lines_do_not_overlap():

@@ -10,10 +10,11 @@ import pytest
 
 from bench import records
 from bench.__main__ import main
-from bench.forms import tables
 from bench.peers import contest
 from bench.peers.contest import PEERS, Peer, figures, row
-from bench.peers.learners import Arguments, Report, ippo_mabrax
+from bench.peers.learners import Arguments, ippo_mabrax
+from bench.peers.report import Report
+from bench.tables import speed
 from pmt_jax import load_config
 from pmt_jax.errors import UsageError
 
@@ -48,7 +49,7 @@ def test_peers_take_turns_and_what_is_missing_is_a_sentence(tmp_path: pathlib.Pa
     assert (ours["physics"], ours["rates"], ours["steps_per_second"]) == ("fake", [100.0, 200.0], 150.0)
     assert ours["rewards"] == [7.0, 7.0] and ours["other_work_cpus"] == 0.5 and report["load_average"]
     assert absent["failed"].startswith("needs torch") and broken["failed"] == "ValueError: too much"
-    shown = tables.TABLES["peers"]({"peers": report})
+    shown = speed.TABLES["peers"]({"peers": report})
     assert "| other | ant_2x4 | fake | 64 x 64 | 5 x 8 | 1 actor | 150 | 1.00 | 7.00 (7.00 to 7.00) |" in shown
     assert (
         "| absent | ant_2x4 | - | 64 x 64 | 5 x 8 | 1 actor | failed: needs torch, which is not installed | - |"
@@ -78,5 +79,5 @@ def test_a_report_leaves_out_what_is_unknown(tmp_path: pathlib.Path):
 
 
 def test_every_peer_says_what_its_update_is():
-    told = [row(peer, {}, [{"failed": "x"}]) for peer in PEERS.values()]
-    assert len({peer["name"] for peer in told}) == len(PEERS) == 7 and all(peer["networks"] for peer in told)
+    found = [row(peer, {}, [{"failed": "x"}]) for peer in PEERS.values()]
+    assert len({peer["name"] for peer in found}) == len(PEERS) == 7 and all(peer["networks"] for peer in found)

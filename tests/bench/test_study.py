@@ -8,14 +8,14 @@ import pathlib
 import numpy as np
 import pytest
 
-from bench.forms import rounds, study
-from bench.forms.study import measures, welch
+from bench.tables import later_studies, study
+from bench.tables.study import measures, welch
 
 
 def stored(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
     """A run of three seeds and ten points whose true episode cost is constant."""
     points, seeds = 10, len(true_cost)
-    config = {"cost_seen": seen, "cost_false": 0.0, "lambda_init": 2.0, "method": method} | settings
+    config = {"cost_seen": seen, "lambda_init": 2.0, "method": method} | settings
     curve = {name: [[1.0] * points] * seeds for name in ("episode_reward", "episode_cost", "violation_rate", "lambda")}
     return {
         "steps": list(range(10, 110, 10)),
@@ -84,11 +84,11 @@ def test_the_second_round_names_each_criterion_that_does_not_hold(tmp_path: path
     every = cells("voltage_33", 1.0, 2, 3, 2) + cells("hand_over_2x6", 1.0, 2, 3, 2)
     every += cells("ant_2x4", 0.03, 2, 2, 9) + cells("voltage_33", 0.05, 4, 2, 9)
     file.write_text(json.dumps(every))
-    rows = [line.strip("| ").split(" | ") for line in rounds.as_candidate(file).splitlines()[2:]]
+    rows = [line.strip("| ").split(" | ") for line in later_studies.as_variant(file).splitlines()[2:]]
     assert [(row[0], row[-1]) for row in rows if "no" in row[-1]] == [("2", "**no**")]
     assert "voltage_33" in next(row[1] for row in rows if "no" in row[-1])
     assert len(rows) == 8
-    lines = [line.split("|") for line in rounds.as_second(file).splitlines()[2:]]
+    lines = [line.split("|") for line in later_studies.as_second(file).splitlines()[2:]]
     assert [line[-2].strip() != "-" for line in lines] == [line[3].strip() == "MAPPO-L" for line in lines]
 
 
@@ -97,14 +97,16 @@ def test_cells_of_a_comparison_are_read_at_the_same_update():
     early = stored("mappo_l", 0.5, [4.0] * 8, num_envs=16, lr_half_life=2e5)
     late = stored("f4sg", 0.5, [6.0] * 8, num_envs=64, lr_half_life=2e5) | {"steps": list(range(40, 840, 80))}
     late["true_episode_cost"] = [[6.0] * 5 + [1.0] * 5] * 8  # what comes after the other's last update
-    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in rounds.beside([[early, late]]).splitlines()[2:]]
+    rows = [
+        [x.strip() for x in line.split("|")[1:-1]] for line in later_studies.compared([[early, late]]).splitlines()[2:]
+    ]
     assert [(row[1], row[3]) for row in rows] == [("MAPPO-L", "4.0 +- 0.0"), ("F4SG", "6.0 +- 0.0")]
     assert [row[-2] for row in rows] == ["0 of 8", "8 of 8"]
     assert rows[0][-1] == "-" and rows[1][-1].startswith("< .001")
 
 
 def test_a_later_form_is_read_at_its_own_end_and_a_cell_without_its_like_alone(tmp_path: pathlib.Path):
-    """As the limits' study fixed before its runs: MACPO's runs of eight million steps beside those of ten."""
+    """As the limits' study fixed before its runs: MACPO's runs of eight million steps next to those of ten."""
     falls = [[8.0] * 5 + [2.0] * 5] * 8
     before = [stored("macpo", 1.0, [2.0] * 8, lambda_rule="integral") | {"true_episode_cost": falls, "cost_limit": 1.0}]
     (tmp_path / "limits_less_noise_h100.json").write_text(json.dumps(before))
@@ -112,7 +114,9 @@ def test_a_later_form_is_read_at_its_own_end_and_a_cell_without_its_like_alone(t
     short["steps"] = [x // 2 for x in short["steps"]]
     file = tmp_path / "x.json"
     file.write_text(json.dumps([short, short | {"cost_limit": 10.0}]))
-    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in rounds.as_after_less_noise(file).splitlines()[2:]]
+    rows = [
+        [x.strip() for x in line.split("|")[1:-1]] for line in later_studies.as_after_less_noise(file).splitlines()[2:]
+    ]
     assert [row[3] for row in rows] == ["2.0 +- 0.0", "4.0 +- 0.0", "4.0 +- 0.0"]
     assert [row[-1] == "-" for row in rows] == [True, False, True]
 

@@ -11,7 +11,7 @@ from importlib import metadata
 import pytest
 
 from envs.physics import contract
-from places import ROOT
+from paths import ROOT
 from pmt_jax import tasks
 from pmt_jax.cli import doctor
 from pmt_jax.render import gl
@@ -27,8 +27,8 @@ def test_doctor(cli):
 
 
 def test_what_is_wrong(cli, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(doctor, "_cache", lambda: doctor.Finding("ok", "compile cache", ""))
-    monkeypatch.setattr(gl, "_PROBE", "raise SystemExit('no such library')")
+    monkeypatch.setattr(doctor, "check_cache", lambda: doctor.Finding("ok", "compile cache", ""))
+    monkeypatch.setattr(gl, "PROBE", "raise SystemExit('no such library')")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     installed = tasks.installed_version
     monkeypatch.setattr(contract, "installed_version", lambda name: "4.0.0" if name == "mujoco" else installed(name))

@@ -69,7 +69,7 @@ def test_envs_lists_and_describes(cli):
 def test_one_episode_has_no_interval_and_long_names_keep_columns(capsys):
     name = "info/a_name_that_is_longer_than_most_of_the_others"
     limits = {"cost_limit": 3.5, "cost_limit/0": 1.0, "cost_limit/1": 2.5}
-    policies._say_row({"seed": 0, "step": 1000, **limits, "reward": (1.0, math.nan), name: (2.0, 0.5)})
+    policies.say_row({"seed": 0, "step": 1000, **limits, "reward": (1.0, math.nan), name: (2.0, 0.5)})
     head, reward, longest = capsys.readouterr().out.splitlines()
     assert head == "seed 0 after 1,000 steps (cost limit 1 + 2.5 an episode)"
     assert reward.endswith("1.0000") and longest.endswith("2.0000 +- 0.5000")

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from by_hand import row, written
-from places import ROOT
+from paths import ROOT
 from pmt_jax.errors import UsageError
 from pmt_jax.files import writing
 from pmt_jax.training import trainer
@@ -91,9 +91,7 @@ train lane --value-norm-decay 1.1 | value_norm_decay must lie in [0, 1], not 1.1
 train lane --cost-limit 1,2 | cost_limit has 2 numbers, but task 'lane' has 1 cost(s)
 train lane --cost-limit 1e39 | cost_limit must be a cost per episode of at least 0 that fits 32 bits, not 1e+39
 train lane --cost-limit one | cost_limit = 'one' does not fit: expected a number, or one for each cost
-train lane --cost-false -0.1 | cost_false must lie in [0, 1), not -0.1
 train lane --lambda-max 0.1 | lambda_init = 0.78 lies above lambda_max = 0.1
-train lane --cost-seen 0.1 --cost-false 0.3 | cost_seen = 0.1 must lie above cost_false = 0.3
 train lane --cost-estimate critic --gamma 1 | set gamma below 1 or take another cost_estimate
 train lane --method macpo --limit-lr 3 | limit_lr must lie in [0, 1], not 3.0
 train lane --method macpo --kl-limit inf | kl_limit must be a number above 0, not inf
@@ -110,7 +108,7 @@ train lane --preset= | unknown preset ''
 train lane --preset ../presets/smoke | unknown preset '../presets/smoke'
 train --preset smoke | the following arguments are required: TASK|CONFIG
 train lane --eval-episodes 0 --eval-interval 1 | eval_episodes must be at least 1
-train lane --sink csv,csvv | unknown sink 'csvv'; did you mean 'csv'?
+train lane --loggers csv,csvv | unknown logger 'csvv'; did you mean 'csv'?
 train lane --devices 0 | --devices must be a whole number of at least 1, not '0'
 train lane --process 0 | --coordinator, --process, --processes belong together
 train lane --coordinator nowhere --process 0 --processes 2 | --coordinator must be HOST:PORT

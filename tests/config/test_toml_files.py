@@ -8,7 +8,7 @@ import tomllib
 
 import pytest
 
-from places import ROOT
+from paths import ROOT
 from pmt_jax import load_config
 from pmt_jax.config import load
 from pmt_jax.errors import UsageError

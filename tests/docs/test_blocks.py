@@ -20,7 +20,7 @@ import pytest
 
 from bench.__main__ import main as bench
 from by_hand import made
-from places import DATA, ROOT
+from paths import DATA, ROOT
 from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
 from pmt_jax.render import gl
@@ -35,7 +35,7 @@ ELSEWHERE = {
     r"pytest": "the first part of .ci/run",
     r"srun|.*--coordinator": "several hosts; tests/training/test_devices.py has several processes",
     r"nvidia-": "an NVIDIA GPU",
-    r".*--sink wandb": "wandb, which .[dev] does not have; tests/training/test_loggers.py runs it if it is installed",
+    r".*--loggers wandb": "wandb, which .[dev] does not have; tests/training/test_loggers.py runs it if it is there",
     r"python -m bench peers": "other programs, which a reader downloads; tests/bench has doubles of them",
     r"python -m bench publish": "replaces policies of the package; tests/policies/test_pretrained.py has a copy",
 }
@@ -49,7 +49,7 @@ def _steps(found: re.Match[str]) -> str:
 SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"--steps ([\d.e]+)(?!\S)", _steps),
     (r"--(seeds|episodes|random) \d+", r"--\1 2"),
-    (r"--(jobs|devices) \d+", r"--\1 1"),
+    (r"--(jobs|workers|devices) \d+", r"--\1 1"),
     (r"sweep ant_2x4", "sweep lane"),
     (r"train voltage_33 --steps \S+", "train voltage_33 --steps 512"),
     (r"--steps 0:150", "--steps 0:9"),

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import pmt_jax
-from places import ROOT
+from paths import ROOT
 from pmt_jax import tasks
 from pmt_jax.cli import flags
 from pmt_jax.cli.commands import make_parser

@@ -18,7 +18,7 @@ from envs.toys import HORIZON, Lane
 
 
 class Fragile(Lane):
-    """`lane` that terminates beyond 0.3 and starts anywhere near 0, so that ends and new starts can be told apart."""
+    """`lane` that terminates beyond 0.3 and starts anywhere near 0, so that new starts show."""
 
     def reset(self, key: jax.Array) -> State:
         return self.restore(jax.random.uniform(key, maxval=0.1), 0, jnp.zeros((2, 2)), key)
@@ -80,7 +80,7 @@ def test_pettingzoo_passes_its_own_test():
     parallel_api_test(adapters.to_pettingzoo(envs.make("noisy")), num_cycles=60)
 
 
-def test_pettingzoo_agents_have_the_actions_they_have_and_feel_their_costs():
+def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
     pytest.importorskip("pettingzoo")
     parallel = adapters.to_pettingzoo(Uneven())
     obs, _ = parallel.reset(seed=1)

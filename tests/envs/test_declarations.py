@@ -14,7 +14,7 @@ import envs
 from envs.base import declarations
 from envs.blocks import length, slices
 from envs.voltage.control import load_scenario
-from places import ROOT
+from paths import ROOT
 
 NEEDS = {"plain": set(), "scene": {"qpos"}, "map": {"vm_pu"}}  # of the quantities that a picture reads
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 import envs
-from places import ROOT
+from paths import ROOT
 from pmt_jax import load_config
 
 EXAMPLE = ROOT / "docs" / "examples" / "my_env.py"

@@ -67,11 +67,11 @@ def test_padded_actions_have_no_regret():
     np.testing.assert_allclose(with_padding, np.log(0.8), rtol=1e-5)
 
 
-def test_regret_is_felt_only_where_it_cost():
+def test_regret_arises_only_where_it_cost():
     logits, cost = jnp.asarray([[2.0, -1.0], [2.0, -1.0]]), jnp.asarray([[1.0], [0.0]])
-    felt = regret.regret(logits, cost)
-    np.testing.assert_allclose(felt[0], jax.nn.sigmoid(logits[0]))
-    np.testing.assert_array_equal(felt[1], 0)
+    found = regret.regret(logits, cost)
+    np.testing.assert_allclose(found[0], jax.nn.sigmoid(logits[0]))
+    np.testing.assert_array_equal(found[1], 0)
 
 
 def test_calibration():

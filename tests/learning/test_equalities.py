@@ -184,13 +184,12 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
     now = schedules.at(setup.config, hyper, state.update)
-    rows = policies.policy_rows(
+    rows = policies.policy_samples(
         setup, hyper, state.constraint.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
     excess = jnp.asarray([[0.5], [0.25]])
-    actor, constraint, _ = policies.update_policies(
-        setup, hyper, now, state.actor, state.constraint, rows, excess, tagged
-    )
+    team = policies.Team(state.actor, state.constraint, rows, excess)
+    actor, constraint, _ = policies.update_policies(setup, hyper, now, team, tagged)
 
     factor = jnp.ones_like(rows.factor[0])
     total = jnp.zeros_like(factor)

@@ -21,15 +21,15 @@ def test_fear_begins_at_the_logit_that_is_asked_for():
 
 def test_without_a_start_fear_begins_at_the_cost_rate_of_the_first_batch():
     rate = jnp.asarray([[0.3], [0.9]])
-    awake = SETUP.nets.awaken_fear(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), rate)
+    awake = SETUP.nets.set_fear_to_cost_rate(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), rate)
     fear = jax.nn.sigmoid(SETUP.nets.fear(awake, STATES))
     np.testing.assert_allclose(fear, jnp.broadcast_to(rate, fear.shape), atol=0.02)
-    again = SETUP.nets.awaken_fear(awake, 1 - rate)
+    again = SETUP.nets.set_fear_to_cost_rate(awake, 1 - rate)
     jax.tree.map(np.testing.assert_array_equal, again, awake)  # once awake, it only learns
 
 
 def test_a_first_batch_without_any_cost_leaves_fear_finite():
-    awake = SETUP.nets.awaken_fear(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), jnp.zeros((2, 1)))
+    awake = SETUP.nets.set_fear_to_cost_rate(SETUP.nets.init_fear(jax.random.key(0), jnp.nan), jnp.zeros((2, 1)))
     assert (jax.nn.sigmoid(SETUP.nets.fear(awake, STATES)) < 0.002).all()
 
 

@@ -75,7 +75,7 @@ def test_conjugate_gradient():
 
 
 def test_uncoupled_entries_are_solved_exactly_however_small_their_curvature():
-    """As a policy's deviations beside a network whose curvatures lie orders of magnitude apart."""
+    """As a policy's deviations next to a network whose curvatures lie orders of magnitude apart."""
     h, b = jnp.r_[jnp.logspace(0, 4, 40), 0.15, 0.2], jnp.ones(42).at[:40].set(10.0)
     uncoupled = jnp.arange(42) >= 40
     np.testing.assert_allclose(solve(lambda v: h * v, b, uncoupled)[40:], 1 / h[40:], rtol=1e-6)

@@ -19,12 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bench.forms import tables
-from places import ROOT
+from bench.tables import speed
+from paths import ROOT
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments
-from pmt_jax.learning.types import ActingState, LearnerState, RunningMoments, TrainState
+from pmt_jax.learning.types import ActingState, Best, LearnerState, RunningMoments, TrainState
 from pmt_jax.policies import evaluate, hub, numpy_policy, publish
 from pmt_jax.training import run_folder
 from pmt_jax.training.checkpoint import Checkpoints, Provenance
@@ -54,7 +54,7 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
     out.mkdir()
     run_folder.write_settings(out, run)
     checkpoints = Checkpoints(out)
-    known = dataclasses.replace(run_folder.initial_best(state), state=pushing(best))
+    known = dataclasses.replace(Best.initial(state), state=pushing(best))
     checkpoints.save(100, {"last": pushing(last), "best": known}, Provenance(run.config))
     checkpoints.close()
     return out
@@ -142,10 +142,10 @@ def test_a_policy_of_the_package(name: str):
 
 
 def test_what_is_told_about_them_and_how_large_they_are():
-    told = publish.rows()
-    assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == told
-    assert tables.hub({"hub": {"rows": told}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
-    assert sum(row["bytes"] for row in told) < 4e6
+    found = publish.rows()
+    assert NAMES and json.loads((ROOT / "bench/results/hub.json").read_text())["rows"] == found
+    assert speed.hub({"hub": {"rows": found}}) in (ROOT / "docs" / "howto" / "pretrained.md").read_text()
+    assert sum(row["bytes"] for row in found) < 4e6
 
 
 def test_their_checksums_are_those_of_their_files():
@@ -230,15 +230,15 @@ def test_packing_costs_no_reward_and_no_safety():
 def test_a_trained_ant_runs_as_it_is_told():
     """Other episodes than the published ones, on the C engine: the two intervals meet."""
     [row] = evaluate.evaluate_run(pathlib.Path("hub:ant_2x4/mappo_l"), 8, True, physics="mujoco")
-    (ours, half), told = row["episode_reward"], hub.about("hub:ant_2x4/mappo_l")["figures"]
-    assert abs(ours - told["episode_reward"][0]) <= half + told["episode_reward"][1]
+    (ours, half), stored = row["episode_reward"], hub.about("hub:ant_2x4/mappo_l")["figures"]
+    assert abs(ours - stored["episode_reward"][0]) <= half + stored["episode_reward"][1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_every_policy_is_as_good_as_it_is_told(name: str):
-    told = hub.about(name)
-    [row] = evaluate.evaluate_run(pathlib.Path(name), told["episodes"], True)
+    stored = hub.about(name)
+    [row] = evaluate.evaluate_run(pathlib.Path(name), stored["episodes"], True)
     for figure in ("episode_reward", "episode_cost"):
-        mean, half = told["figures"][figure]
+        mean, half = stored["figures"][figure]
         assert abs(row[figure][0] - mean) <= half + row[figure][1]

@@ -21,7 +21,7 @@ NOT_A_TASK = "has no class or function 'Env'"  # what is said once a file has be
 
 @pytest.fixture
 def place(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
-    """A working folder with a run in it, a folder beside it, and a user of whom nothing is known."""
+    """A working folder with a run in it, a folder next to it, and a user of whom nothing is known."""
     (tmp_path / "work" / "run" / "checkpoints").mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))

@@ -81,8 +81,8 @@ def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_pretrained_policy_brings_what_acts():
     setup, fresh = first("ant_2x4", hidden=(128, 128), init="hub:ant_2x4/f4sg")
-    state, (_, told) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))
-    chex.assert_trees_all_equal(state.actor.params, told.actor.params)
+    state, (_, pretrained) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))
+    chex.assert_trees_all_equal(state.actor.params, pretrained.actor.params)
     chex.assert_trees_all_equal(state.critic, fresh.critic)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from by_hand import row, written
-from places import ROOT
+from paths import ROOT
 from pmt_jax.limits import Limits
 from pmt_jax.render import episode, film, report
 

@@ -240,7 +240,7 @@ def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeyp
 
 
 def test_without_opengl_a_sentence_names_the_way_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(gl, "_PROBE", "raise SystemExit(1)  # {0}")
+    monkeypatch.setattr(gl, "PROBE", "raise SystemExit(1)  # {0}")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with pytest.raises(UsageError, match=r"no OpenGL works here \(tried .*-o replay.html"):
         gl.choose()
@@ -282,7 +282,7 @@ def test_limits_of_several_costs_are_no_metric_of_a_report(monkeypatch: pytest.M
         "faults": "",
     }
     monkeypatch.setattr(report.evaluate, "evaluate_run", lambda *_: [result])
-    text = "".join(report._evaluation(pathlib.Path("x"), 2))
+    text = "".join(report.evaluation(pathlib.Path("x"), 2))
     assert "1.00 ± 0.50" in text and "2.00 ± 0.10" in text and "limit" not in text
 
 

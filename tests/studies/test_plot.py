@@ -74,14 +74,14 @@ def test_ticks_of_a_cost_axis_can_be_read():
     )
 
 
-def test_true_costs_are_drawn_where_not_all_are_felt():
-    felt = run("f4sg", cost_seen=0.1)
+def test_true_costs_are_drawn_where_not_all_are_observed():
+    observed = run("f4sg", cost_seen=0.1)
     rate = np.full((1, 20), 0.01)
-    metrics = felt.metrics | {"violation_rate": rate, "true_violation_rate": rate, "true_episode_cost": 50 * rate}
-    same = groups([RunLog(**{**vars(felt), "metrics": metrics})])
+    metrics = observed.metrics | {"violation_rate": rate, "true_violation_rate": rate, "true_episode_cost": 50 * rate}
+    same = groups([RunLog(**{**vars(observed), "metrics": metrics})])
     assert not [name for name in plot.panels(same, plot.TRAINING) if name.startswith("true")]
     metrics = metrics | {"true_violation_rate": 10 * rate}
-    (seldom,) = groups([RunLog(**{**vars(felt), "metrics": metrics})])
+    (seldom,) = groups([RunLog(**{**vars(observed), "metrics": metrics})])
     assert [n for n in plot.panels([seldom], plot.TRAINING) if n.startswith("true")] == [
         "true_episode_cost",
         "true_violation_rate",

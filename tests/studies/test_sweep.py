@@ -97,8 +97,8 @@ def test_the_same_command_again_trains_nothing_and_shows_the_points_best_first(s
 def test_interrupted_and_resumed_is_uninterrupted(swept: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     write = Jsonl.write
 
-    def interrupt(sink: Jsonl, log: list[dict]) -> None:
-        write(sink, log)
+    def interrupt(logger: Jsonl, log: list[dict]) -> None:
+        write(logger, log)
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
@@ -192,7 +192,7 @@ def test_what_is_traced_shares_a_program_and_what_is_static_does_not(tmp_path: p
     vary = {"method": ["happo", "f4sg"], "lambda_lr": ["0.1", "0.30"], "cost_limit": ["1", "2"], "seed": ["0", "5"]}
     points = make_points([Part("lane", vary)])
     assert len(points) == 16 and "method=f4sg,lambda_lr=0.3,cost_limit=2,seed=5" in points
-    groups = [list(group.values()) for _, group in sweep._groups(points, points, tmp_path)]
+    groups = [list(group.values()) for _, group in sweep.grouped(points, points, tmp_path)]
     assert [len(group) for group in groups] == [8, 8]
     assert all(len({c.method for c in group}) == 1 for group in groups)
 

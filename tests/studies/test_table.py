@@ -12,7 +12,7 @@ import scipy.stats
 from by_hand import made, row, written
 from pmt_jax.limits import Limits
 from pmt_jax.studies import statistics
-from pmt_jax.studies.rows import Row
+from pmt_jax.studies.rows import TableRow
 
 
 def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
@@ -57,7 +57,7 @@ def test_a_table_says_how_the_limit_was_kept(tmp_path: pathlib.Path, cli):
 
 
 def test_limits_are_those_of_the_costs_beside_them(tmp_path: pathlib.Path, cli):
-    """Each of several; on true costs where not all are felt."""
+    """Each of several; on true costs where not all are observed."""
     each = {"cost_limit": 25.1, "cost_limit/0": 25.0, "cost_limit/1": 0.1, "episode_cost": 3.0}
     each |= {"episode_cost/0": 2.0, "episode_cost/1": 1.0}
     written(tmp_path / "two", [row(100, 0, 1.0, **each)])
@@ -174,9 +174,9 @@ def test_tables_that_cannot_be_made(tmp_path: pathlib.Path, cli):
 
 
 def test_the_best_row_is_the_one_with_most_reward_within_the_limit():
-    def row(reward: float, cost: float) -> Row:
+    def row(reward: float, cost: float) -> TableRow:
         scores = {"reward": np.array([reward]), "cost": np.array([cost])}
-        return Row("lane", "happo", "", Limits((1.0,)), 1, "training", scores)
+        return TableRow("lane", "happo", "", Limits((1.0,)), 1, "training", scores)
 
     best = [row(2, 1.0), row(1, 0.0), row(9, 1.5), row(5, 3.0), row(np.nan, np.nan)]
     shuffled = [best[i] for i in (4, 2, 0, 3, 1)]
@@ -192,16 +192,16 @@ def test_seeds_beyond_the_limit_show(tmp_path: pathlib.Path, cli):
     assert "seeds within: seeds whose cost is within it" in text
 
 
-def test_true_costs_show_where_not_all_are_felt(tmp_path: pathlib.Path, cli):
+def test_true_costs_show_where_not_all_are_observed(tmp_path: pathlib.Path, cli):
     true = {"true_episode_cost": 5.0, "true_violation_rate": 0.25, "true_step_cost": 0.2}
-    made(tmp_path / "felt", "lane", "mappo_l", {0: [1, 5.0]}, **true)
-    assert "true" not in cli("table", tmp_path / "felt")[1]
+    made(tmp_path / "observed", "lane", "mappo_l", {0: [1, 5.0]}, **true)
+    assert "true" not in cli("table", tmp_path / "observed")[1]
     true["true_violation_rate"] = 0.5
     made(tmp_path / "seldom", "lane", "f4sg", {0: [1, 0.5], 1: [2, 0.4]}, cost_seen=0.1, **true)
     code, out, _ = cli("table", tmp_path, "--format", "json", "--baseline", "mappo_l")
     row = {row["method"]: row for row in json.loads(out)["rows"]}["f4sg"]
     assert code == 0 and row["true cost"]["iqm"] == 5 and row["true step cost"]["iqm"] == 0.2
-    assert row["within"] == 1 and row["worst"] == 5  # the limit on what is felt is 1, a tenth of 10
+    assert row["within"] == 1 and row["worst"] == 5  # the limit on what is observed is 1, a tenth of 10
     assert row["better"]["less true cost"]["probability"] == 0.5
 
 

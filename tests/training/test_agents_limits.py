@@ -16,7 +16,7 @@ import pytest
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import evaluate
-from pmt_jax.learning.types import LearnerState
+from pmt_jax.learning.types import Best, LearnerState
 from pmt_jax.policies import publish
 from pmt_jax.policies.load import trusting
 from pmt_jax.render import episode
@@ -168,7 +168,7 @@ def test_the_policy_that_is_published_keeps_every_agent_within(file: pathlib.Pat
     tmp_path.joinpath("run").mkdir()
     out = tmp_path / "run"
     run_folder.write_settings(out, setup)
-    known = dataclasses.replace(run_folder.initial_best(state), state=pushing(0.0, 0.0))
+    known = dataclasses.replace(Best.initial(state), state=pushing(0.0, 0.0))
     checkpoints = Checkpoints(out)
     checkpoints.save(100, {"last": pushing(1.0, 0.0), "best": known}, Provenance(setup.config))
     checkpoints.close()

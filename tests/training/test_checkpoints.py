@@ -193,7 +193,7 @@ def test_a_checkpoint_that_does_not_say_what_it_belongs_to(copy: pathlib.Path, c
     saved = checkpoint.newest(copy, print)
     shutil.rmtree(copy / "checkpoints")
     checkpoints = checkpoint.Checkpoints(copy)
-    checkpoints._write(STEPS, saved.packed)
+    checkpoints.write_table(STEPS, saved.packed)
     checkpoints.close()
     for words in (("eval", copy, "--episodes", 1), (*RESUME, copy)):
         code, text, _ = cli(*words)
@@ -206,7 +206,7 @@ def test_the_trials_of_a_sweep_belong_to_its_checkpoint():
     trials = [Trials(hyper, jnp.array(seeds)) for seeds in ([0, 1], [0, 2])]
     ours, theirs = (checkpoint.Provenance.of(type(setup)(setup.config, *_rest(setup), trials=x)) for x in trials)
     assert ours.differences(theirs) == {"seed of the trials": "[0, 1] -> [0, 2]"} and not ours.differences(ours)
-    step, back = checkpoint.Provenance.loads(ours.dumps(400))
+    step, back = checkpoint.Provenance.from_bytes(ours.to_bytes(400))
     assert step == 400 and not back.differences(ours) and back.trials["seed"] == [0, 1]
     assert not ours.differences(checkpoint.Provenance(setup.config))
 
@@ -288,9 +288,9 @@ def test_a_report_says_once_and_plainly_what_it_passes_over(copy: pathlib.Path, 
 def test_what_is_written_is_what_is_read():
     config = load_config("lane", "f4sg", cost_limit=2.5, seeds=3, seed=4)
     provenance = checkpoint.Provenance(config)
-    written = provenance.dumps(1234)
+    written = provenance.to_bytes(1234)
     assert json.loads(np.asarray(written).tobytes())["seeds"] == [4, 5, 6]
-    assert checkpoint.Provenance.loads(written) == (1234, provenance)
+    assert checkpoint.Provenance.from_bytes(written) == (1234, provenance)
     unknown = json.loads(written.tobytes()) | {"settings": 'task = "lane"\nnever = 1\n'}
     with pytest.raises(UsageError, match="unknown setting 'never'"):
-        checkpoint.Provenance.loads(np.frombuffer(json.dumps(unknown).encode(), np.uint8))
+        checkpoint.Provenance.from_bytes(np.frombuffer(json.dumps(unknown).encode(), np.uint8))

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from places import ROOT
+from paths import ROOT
 from pmt_jax.policies import load
 from pmt_jax.training import checkpoint, processes
 

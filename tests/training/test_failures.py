@@ -94,17 +94,17 @@ def test_memory_and_devices(
 
 def test_a_device_that_returns_nothing_any_more(tmp_path: pathlib.Path, cli, monkeypatch):
     """Then the newest checkpoint is all that is left, and the sentence says so."""
-    save, train_chunk = trainer.Trainer._save, trainer.Trainer._train_chunk
+    save, train_chunk = trainer.Trainer.save, trainer.Trainer.train_chunk
 
     def fail_at_600(self: trainer.Trainer):
         if self.step == 600:
-            monkeypatch.setattr(trainer.Trainer, "_save", lambda self: self._train_chunk())
+            monkeypatch.setattr(trainer.Trainer, "save", lambda self: self.train_chunk())
             raise jax.errors.JaxRuntimeError("INTERNAL: the device is lost")
         if self.step == 400:
             save(self)
         return train_chunk(self)
 
-    monkeypatch.setattr(trainer.Trainer, "_train_chunk", fail_at_600)
+    monkeypatch.setattr(trainer.Trainer, "train_chunk", fail_at_600)
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
     assert code == 1 and not err
     assert "stopped: the device failed: INTERNAL: the device is lost; what came after step 400 could not be" in text
@@ -115,7 +115,7 @@ def test_a_worker_that_fails_says_why(tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sensor.py").write_text(CALLBACK)
     (tmp_path / "offline").touch()
-    words = ("sensor.py", *TINY, "--method", "mappo", "--steps", 2000, "--no-cache", "--seeds", 2, "--jobs", 2)
+    words = ("sensor.py", *TINY, "--method", "mappo", "--steps", 2000, "--no-cache", "--seeds", 2, "--workers", 2)
     code, text, err = cli("train", *words, "--out", "run")
     assert code == 1 and not err
     assert "stopped: a host callback raised RuntimeError: the sensor is offline (sensor.py, line 12); saved as " in text

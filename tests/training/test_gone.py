@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from pmt_jax.training import claims, loggers, trainer
+from pmt_jax.training import lock, loggers, trainer
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 RUN = ("train", *ARGUMENTS, "--steps", STEPS)
@@ -38,8 +38,8 @@ def copied(folder: pathlib.Path) -> None:
     shutil.copytree(folder.with_name("elsewhere"), folder)
 
 
-def unclaimed(folder: pathlib.Path) -> None:
-    (folder / ".claim").unlink()
+def unlocked(folder: pathlib.Path) -> None:
+    (folder / ".lock").unlink()
 
 
 def without_rows(folder: pathlib.Path) -> None:
@@ -52,9 +52,9 @@ def rows_edited(folder: pathlib.Path) -> None:
     (folder / "new").rename(folder / "metrics.jsonl")
 
 
-def claimed_by_another(folder: pathlib.Path) -> None:
+def locked_by_another(folder: pathlib.Path) -> None:
     emptied(folder)
-    (folder / ".claim").write_text('{"pid": 1, "host": "node7", "since": "2026-01-01 00:00:00"}')
+    (folder / ".lock").write_text('{"pid": 1, "host": "node7", "since": "2026-01-01 00:00:00"}')
     (folder / "config.toml").write_text("# another run's\n")
 
 
@@ -62,8 +62,8 @@ def with_its_parent(folder: pathlib.Path) -> None:
     shutil.rmtree(folder.parent)
 
 
-OF_A_CLAIM = (deleted, renamed, emptied, copied, unclaimed, claimed_by_another, with_its_parent)
-HOW = (*OF_A_CLAIM, without_rows, rows_edited)
+OF_A_LOCK = (deleted, renamed, emptied, copied, unlocked, locked_by_another, with_its_parent)
+HOW = (*OF_A_LOCK, without_rows, rows_edited)
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def happens(monkeypatch: pytest.MonkeyPatch):
     return arrange
 
 
-QUICK = ((deleted, 600), (renamed, STEPS), (claimed_by_another, 600), (without_rows, 600))
+QUICK = ((deleted, 600), (renamed, STEPS), (locked_by_another, 600), (without_rows, 600))
 REST = ((what, step) for what in HOW for step in (600, STEPS) if (what, step) not in QUICK)
 
 
@@ -95,13 +95,13 @@ def test_a_run_whose_folder_is_gone_is_saved_beside_it_and_goes_on_bit_for_bit(
     out = tmp_path / "runs" / "a b"
     happens(what, out, step)
     seen: list[dict[str, bytes]] = []
-    monkeypatch.setattr(claims.Gone, "__init__", lambda self, *_: seen.append(content(out) if out.exists() else {}))
+    monkeypatch.setattr(lock.Gone, "__init__", lambda self, *_: seen.append(content(out) if out.exists() else {}))
     code, text, err = cli(*RUN, "--out", out)
     assert code == 1 and not err and "Traceback" not in text
     said, saved = text.splitlines()[-1], out.with_name("a b-rescued")
     assert said.startswith("stopped: ") and f"saved as of step {step:,} in {saved}. Continue with: pmt " in said
     left = content(out) if out.exists() else {}
-    ours = {".claim"} if what in (without_rows, rows_edited) else set()  # there the folder is still the run's
+    ours = {".lock"} if what in (without_rows, rows_edited) else set()  # there the folder is still the run's
     assert left == {name: data for name, data in seen[0].items() if name not in ours}  # nothing was written after it
     monkeypatch.undo()
     assert [row["step"] for row in rows(saved)][-1] == step
@@ -132,7 +132,7 @@ def test_a_run_that_goes_on_says_so_before_it_writes(copy: pathlib.Path, cli, mo
     before = content(copy)
     code, text, _ = cli(*RUN, "--out", copy, "--resume", "--steps", STEPS + 200)
     assert code == 1 and f"stopped: {copy} was deleted, renamed or replaced" in text and "nothing new" in text
-    assert content(copy) == before | {".claim": (copy / ".claim").read_bytes()}
+    assert content(copy) == before | {".lock": (copy / ".lock").read_bytes()}
     assert (copy / "checkpoints" / "2000").is_dir() and not copy.with_name("copy-rescued").exists()
 
 
@@ -151,15 +151,15 @@ def test_no_place_beside_it(tmp_path: pathlib.Path, cli, happens, monkeypatch):
     assert code == 1 and not err and text.splitlines()[-1].endswith("No space left on device")
 
 
-@pytest.mark.parametrize("what", OF_A_CLAIM)
-def test_a_claim_ends_without_touching_the_folder_that_took_its_place(what: Callable, tmp_path: pathlib.Path):
+@pytest.mark.parametrize("what", OF_A_LOCK)
+def test_a_lock_ends_without_touching_the_folder_that_took_its_place(what: Callable, tmp_path: pathlib.Path):
     out = tmp_path / "runs" / "x"
-    with claims.claim(out):
-        assert claims.is_held(out)
+    with lock.acquire(out):
+        assert lock.is_held(out)
         what(out)
-        assert not claims.is_held(out)
+        assert not lock.is_held(out)
         before = content(tmp_path)
-    assert content(tmp_path) == before and not claims.is_held(out)
+    assert content(tmp_path) == before and not lock.is_held(out)
 
 
 @pytest.mark.full
@@ -190,8 +190,8 @@ def test_what_follows_in_a_sweep_that_is_gone_is_not_trained(tmp_path: pathlib.P
 
     words = ("sweep", "lane", *ARGUMENTS[1:11], "--method", "mappo_l", "--steps", 200, "--no-cache")
     out = tmp_path / "sweep"
-    cut = sweep._cut
-    monkeypatch.setattr(sweep, "_cut", lambda *a: (cut(*a), emptied(out)))
+    cut = sweep.cut_points
+    monkeypatch.setattr(sweep, "cut_points", lambda *a: (cut(*a), emptied(out)))
     code, text, err = cli(*words, "--set", "activation=relu,tanh", "--out", out)
     assert code == 1 and not err and f"stopped: {out} was deleted, renamed or replaced" in text
     assert not list(out.iterdir())

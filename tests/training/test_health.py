@@ -16,8 +16,9 @@ import pytest
 
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.debug import SEEDS, NotFinite, check_finite, checked, watched
-from pmt_jax.training import health, jobs, trainer
+from pmt_jax.training import health, trainer
 from pmt_jax.training.metrics import LOSSES
+from pmt_jax.training.workers import WorkerLost
 from runs import ARGUMENTS, STEPS, rows, saved
 
 
@@ -70,14 +71,14 @@ def test_one_seed_breaks_and_the_other_trains_on(whole: pathlib.Path, tmp_path: 
 
 def test_a_worker_that_is_lost_after_a_seed_broke_costs_one_chunk(tmp_path: pathlib.Path, cli, monkeypatch):
     breaking(monkeypatch, {1: 3})
-    evaluate = trainer.Trainer._evaluate
+    evaluate = trainer.Trainer.evaluate
 
     def evaluate_until_lost(self: trainer.Trainer, rows: Any) -> None:
         if self.step == 800:
-            raise jobs.Lost("a worker died")
+            raise WorkerLost("a worker died")
         evaluate(self, rows)
 
-    monkeypatch.setattr(trainer.Trainer, "_evaluate", evaluate_until_lost)
+    monkeypatch.setattr(trainer.Trainer, "evaluate", evaluate_until_lost)
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
     assert code == 1 and not err and "stopped: a worker died; saved as of step 600" in text
     assert saved(tmp_path / "run")["0.update"].tolist() == [6, 2]

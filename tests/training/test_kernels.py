@@ -1,4 +1,4 @@
-"""Kernels of the physics compile beside XLA's program and before the first update; Warp's own lines stay away."""
+"""Kernels of the physics compile in parallel with XLA's program, before the first update; Warp's lines stay away."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import threading
 
 import pytest
 
+from envs.base import Declarations
 from pmt_jax import tasks
 from pmt_jax.training import compile
 from runs import ARGUMENTS, environment
@@ -55,17 +56,18 @@ def test_what_fails_inside_leaves_kernels_uncompiled(monkeypatch):
 
 
 def test_only_warp_has_kernels(cli, tmp_path):
-    assert tasks.kernels(tasks.make("lane")) == []
+    for env in tasks.make("lane"), tasks.make("ant_2x4", "mujoco"):
+        assert not tasks.declarations(env).kernels()
     code, text, _ = cli("train", *ARGUMENTS, "--steps", 200, "--out", tmp_path / "run")
     assert code == 0 and " kernels ready" not in text
 
 
 @pytest.mark.full
 def test_training_starts_without_warps_private_places(cli, tmp_path, monkeypatch):
-    def missing(env: object) -> list:
+    def missing() -> list:
         raise AttributeError("no Module")
 
-    monkeypatch.setattr(tasks, "kernels", missing)
+    monkeypatch.setattr(tasks, "declarations", lambda env: Declarations(kernels=missing))
     quick = ("--method", "mappo", "--eval-interval", 0)
     arguments = [*ARGUMENTS[:-1], *quick, "--hidden", 7, "--no-cache"]  # nothing compiled before
     code, text, _ = cli("train", *arguments, "--steps", 200, "--out", tmp_path / "run")
@@ -79,14 +81,14 @@ def test_verbose_asks_for_what_warp_prints(cli, tmp_path, monkeypatch):
     assert logger.isEnabledFor(logging.INFO)
 
 
-REHEARSED = """
+RECORDED = """
 import json, sys
 import jax, jax.numpy as jnp
 import envs
-from envs.physics import contract, warp_kernels
+from envs.physics import contract
 contract.obstacle = lambda name: None  # on a CPU warp steps, so slowly that nobody is offered it
 env = envs.make(sys.argv[1], physics="warp")
-kernels = warp_kernels.needed()
+kernels = env.declares.kernels()
 for kernel in kernels:
     kernel()
 from warp._src.context import Module
@@ -101,10 +103,10 @@ print(json.dumps([len(kernels), late]))
 
 @pytest.mark.full
 @pytest.mark.parametrize("task", ["ant_2x4", "hand_over_2x6"])
-def test_a_rehearsed_step_compiles_nothing_and_prints_nothing(task: str, tmp_path: pathlib.Path):
+def test_a_recorded_step_compiles_nothing_and_prints_nothing(task: str, tmp_path: pathlib.Path):
     pytest.importorskip("warp")
     where = environment() | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", REHEARSED, task]
+    command = [sys.executable, "-c", RECORDED, task]
     done = subprocess.run(command, env=where, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     assert "Module" not in done.stdout

@@ -20,7 +20,7 @@ from runs import ARGUMENTS, STEPS, assert_same_run, rows
 def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     pytest.importorskip("tensorboardX")
     out = tmp_path / "run"
-    arguments = ("train", *ARGUMENTS, "--out", out, "--sink", "csv,tensorboard")
+    arguments = ("train", *ARGUMENTS, "--out", out, "--loggers", "csv,tensorboard")
     assert cli(*arguments, "--steps", 400)[0] == 0
     assert cli(*arguments, "--steps", STEPS, "--resume", "--profile", tmp_path / "trace")[0] == 0
     with (out / "metrics.csv").open(newline="") as file:
@@ -38,16 +38,18 @@ def test_weights_and_biases_without_a_network(tmp_path: pathlib.Path, cli, monke
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--steps", 400, "--out", out, "--sink", "wandb")[0] == 0
+    assert cli("train", *ARGUMENTS, "--steps", 400, "--out", out, "--loggers", "wandb")[0] == 0
     identity = (out / "wandb-id").read_text()
     assert len(list((out / "wandb").glob(f"offline-run-*-{identity}"))) == 1
 
 
-def test_sinks_that_are_not_there(tmp_path: pathlib.Path, cli, monkeypatch):
+def test_loggers_that_are_not_there(tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    code, _, err = cli("train", "lane", "--sink", "csv,wandb", "--out", tmp_path / "x")
-    assert code == 2 and err == "pmt: sink 'wandb' needs wandb; install it with pip install 'pmt-jax[log]'\n"
-    assert "unknown sink 'tensorbord'; did you mean 'tensorboard'?" in cli("train", "lane", "--sink", "tensorbord")[2]
+    code, _, err = cli("train", "lane", "--loggers", "csv,wandb", "--out", tmp_path / "x")
+    assert code == 2 and err == "pmt: logger 'wandb' needs wandb; install it with pip install 'pmt-jax[log]'\n"
+    assert (
+        "unknown logger 'tensorbord'; did you mean 'tensorboard'?" in cli("train", "lane", "--loggers", "tensorbord")[2]
+    )
     assert not (tmp_path / "x").exists()
 
 
@@ -57,8 +59,8 @@ def test_a_wandb_without_a_key_is_refused_before_anything_is_compiled(tmp_path: 
     wandb.api = types.SimpleNamespace(api_key=None)  # pyright: ignore[reportAttributeAccessIssue]
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    code, out, err = cli("train", "lane", "--sink", "wandb", "--out", tmp_path / "x")
-    assert code == 2 and not out and err.startswith("pmt: sink 'wandb' has no key; run wandb login")
+    code, out, err = cli("train", "lane", "--loggers", "wandb", "--out", tmp_path / "x")
+    assert code == 2 and not out and err.startswith("pmt: logger 'wandb' has no key; run wandb login")
     assert not (tmp_path / "x").exists()
 
 

@@ -80,10 +80,10 @@ def whole_checkpoints(folder: pathlib.Path, of: pathlib.Path) -> list[int]:
     """The steps of which a copy has every file of the run `of` that matters, newest first."""
     found = []
     for step in CHECKPOINTS:
-        with contextlib.suppress(checkpoint._Damaged):
-            ours, theirs = (checkpoint._read(run / "checkpoints" / str(step)) for run in (folder, of))
+        with contextlib.suppress(checkpoint.Damaged):
+            ours, theirs = (checkpoint.read_table(run / "checkpoints" / str(step)) for run in (folder, of))
             assert all(
-                np.array_equal(ours[path], theirs[path]) for path in theirs if not path.startswith(checkpoint._ROW)
+                np.array_equal(ours[path], theirs[path]) for path in theirs if not path.startswith(checkpoint.ROW)
             )
             found.append(step)
     return found[::-1]
@@ -126,7 +126,7 @@ def continues(folder: pathlib.Path, whole: pathlib.Path, by_file: bool) -> None:
     assert {key for key in had if key[0] <= behind} <= set(now) and (behind or set(had) <= set(aside))
     if settings_whole or kept or not by_file:
         theirs, ours = saved(whole), saved(folder)
-        assert all(np.array_equal(ours[path], theirs[path]) for path in theirs if not path.startswith(checkpoint._ROW))
+        assert all(np.array_equal(ours[path], theirs[path]) for path in theirs if not path.startswith(checkpoint.ROW))
     assert {(row["step"], row["seed"]) for row in rows(folder)} == set(now)
 
 

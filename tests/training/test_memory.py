@@ -22,7 +22,7 @@ from runs import ARGUMENTS, STEPS
     ],
 )
 def test_what_cannot_fit_is_refused(flags, says, cli, monkeypatch, tmp_path: pathlib.Path):
-    monkeypatch.setattr(compile, "_device_memory", lambda: 10e6)
+    monkeypatch.setattr(compile, "device_memory", lambda: 10e6)
     code, _, err = cli("train", "lane", "--steps", "1e6", *flags, "--out", tmp_path / "x")
     assert code == 2 and says in err and err.count("\n") == 1
     assert not (tmp_path / "x").exists()
@@ -59,7 +59,7 @@ def test_a_device_without_room_gets_a_sentence(message: str, cli, monkeypatch, t
 def test_xla_tries_out_no_kernels_on_a_gpu(backend: str, flags: str, options: Any, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    assert compile._options() == options
+    assert compile.xla_options() == options
     assert jax.jit(lambda x: x + 1).lower(1).compile(options)(1) == 2  # the name is one that XLA knows
 
 

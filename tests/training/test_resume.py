@@ -68,7 +68,7 @@ def test_a_signal_saves_and_the_command_continues(
     monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(number)))
     out = tmp_path / "a b"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
-    assert code == 128 + number and not (out / ".claim").exists()
+    assert code == 128 + number and not (out / ".lock").exists()
     command = re.search(r"interrupted after 200 steps; saved. Continue with: pmt (.*)", text)
     assert command and [p.name for p in (out / "checkpoints").iterdir()] == ["200"]
     monkeypatch.undo()
@@ -156,10 +156,10 @@ def test_lost_files(whole: pathlib.Path, copy: pathlib.Path, cli):
 def test_a_checkpoint_from_before_a_task_told_more_is_still_good(whole: pathlib.Path):
     state = load.load_run(whole)[1]
     packed = checkpoint.pack(state)
-    (told,) = [path for path in packed if ".env.info[" in path]
-    older = {path: x for path, x in packed.items() if path != told}
-    after = checkpoint.pack(checkpoint.unpack(older | {told.replace("position", "forgotten"): packed[told]}, state))
-    assert after.keys() == packed.keys() and not after[told].any()
+    (entry,) = [path for path in packed if ".env.info[" in path]
+    older = {path: x for path, x in packed.items() if path != entry}
+    after = checkpoint.pack(checkpoint.unpack(older | {entry.replace("position", "forgotten"): packed[entry]}, state))
+    assert after.keys() == packed.keys() and not after[entry].any()
     assert all(np.array_equal(after[path], x) for path, x in older.items())
     with pytest.raises(UsageError, match="another kind of run: it differs in .*multiplier"):
         checkpoint.unpack({path: x for path, x in packed.items() if "multiplier" not in path}, state)
@@ -203,7 +203,7 @@ def test_a_row_that_is_none_of_a_run(row: str, copy: pathlib.Path, cli):
     metrics.write_text(before := metrics.read_text() + row + "\n")
     code, _, err = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
     assert code == 2 and f"{metrics} holds a row with" in err and "delete that line" in err and err.count("\n") == 1
-    assert metrics.read_text() == before and not (copy / ".claim").exists()
+    assert metrics.read_text() == before and not (copy / ".lock").exists()
 
 
 def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):

@@ -71,7 +71,7 @@ def test_ctrl_c_twice_in_a_long_chunk_ends_the_run_at_once(tmp_path: pathlib.Pat
     process.send_signal(signal.SIGINT)
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 130 and text == "interrupted: what was not saved is lost\n"
-    assert not (tmp_path / ".claim").exists()
+    assert not (tmp_path / ".lock").exists()
 
 
 def test_a_run_that_ends_at_once_gives_the_terminal_its_cursor_back(monkeypatch: pytest.MonkeyPatch):
@@ -80,7 +80,7 @@ def test_a_run_that_ends_at_once_gives_the_terminal_its_cursor_back(monkeypatch:
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setattr(os, "_exit", lambda code: terminal.write(f" exit {code}"))
     interrupts = signals.Interrupts(lambda text: terminal.write(text), lambda: None)
-    interrupts._answer(signal.SIGINT, at_once=True)
+    interrupts.answer(signal.SIGINT, at_once=True)
     assert terminal.getvalue() == "interrupted: nothing new was trained yet\x1b[?25h exit 130"
 
 
@@ -130,7 +130,7 @@ def test_an_update_that_takes_too_long_is_given_up_and_what_was_trained_is_saved
     assert process.stdout and any(line == "busy\n" for line in process.stdout)
     process.send_signal(number)
     text, err = process.communicate(timeout=120)
-    assert process.returncode == 128 + number and not err and not (out / ".claim").exists()
+    assert process.returncode == 128 + number and not err and not (out / ".lock").exists()
     assert "interrupted in a long chunk: saved as of step 400. Continue with: pmt train" in text
     assert cli(*words, "--resume")[0] == 0
     assert_same_run(out, whole)

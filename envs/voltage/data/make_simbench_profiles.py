@@ -25,7 +25,7 @@ def read(path: Path, columns: list[str]) -> np.ndarray:
 
 
 def main() -> None:
-    """Writes the pack beside this file."""
+    """Writes the pack next to this file."""
     spec = importlib.util.find_spec("simbench")
     if spec is None or spec.origin is None:
         raise SystemExit("pip install --no-deps simbench==1.6.3 first")

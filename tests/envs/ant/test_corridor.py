@@ -16,7 +16,7 @@ import envs
 from envs.ant import corridor, walls
 from envs.errors import TaskError
 from native import compiled
-from places import DATA
+from paths import DATA
 
 TOLERANCE = {"qpos": 5e-5, "qvel": 5e-3, "reward_contact": 1e-5, "reward": 2e-3, "torso_xpos": 5e-5}
 # Here the ant stands inside a wall, which turns it at 1e-3 rad/s for the control step. Ours are drawn only.
@@ -355,7 +355,7 @@ def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
 
 
 @pytest.mark.slow  # MJX compiles it for a minute
-def test_mjx_feels_solid_walls_as_c_does():
+def test_mjx_sees_solid_walls_as_c_does():
     env, step = walled("solid", "mjx")
     states = flight("solid")[:16]
     restore = jax.jit(lambda state: jax.vmap(env.restore)(**jax.vmap(env.raw)(state)))

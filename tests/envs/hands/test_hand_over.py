@@ -16,7 +16,7 @@ import envs
 from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
-from places import ROOT
+from paths import ROOT
 
 CATCH = ROOT / "bench" / "results" / "hand_over_catch.json"
 COUNT = 1000  # starts of the session's batch; the action 0 is the middle of all ranges, a half-flexed hand
@@ -272,7 +272,7 @@ def test_energy_does_not_grow_with_actions_off():
         assert max(energies) <= energies[0] + 1e-4 and energies[-1] < 0.9 * energies[0]
 
 
-def test_fingertips_feel_the_egg_and_not_their_own_weight(holding):
+def test_fingertips_sense_the_egg_and_not_their_own_weight(holding):
     env = made()
     in_the_air = np.r_[np.full(48, 0.3), 0, -0.4, 9, 1, 0, 0, 0]
     state = env.restore(in_the_air, np.zeros(54), [1, 0, 0, 0], np.zeros(40))

@@ -20,7 +20,7 @@ from envs.ant import corridor, walls
 from envs.errors import TaskError
 from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
-from places import ROOT
+from paths import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 PLAIN = {"torso": ("xpos", 1), "motors": ("qfrc_actuator", slice(6, 14, 2))}

@@ -27,7 +27,7 @@ from envs.physics.fused import model as tables_of
 from envs.physics.fused_engine import FusedEngine
 from envs.velocity import robots
 from native import compiled
-from places import ROOT
+from paths import ROOT
 from pmt_jax import tasks
 
 pytestmark = compiled

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from envs.physics import host_call
-from places import ROOT
+from paths import ROOT
 
 
 def run(script: str, timeout: float = 240.0, **environment: str) -> subprocess.CompletedProcess[str]:

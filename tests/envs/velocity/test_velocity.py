@@ -15,10 +15,10 @@ from envs.errors import TaskError
 from envs.vector import VectorEnv
 from envs.velocity import VARIANTS, robots
 from native import compiled
-from places import DATA
+from paths import DATA
 
 NAMES = [f"velocity_{variant}" for variant in VARIANTS]
-PLACES = ("torso_xpos", "com")  # what `restore` takes beside qpos, of the robots that have it
+PLACES = ("torso_xpos", "com")  # what `restore` takes next to qpos, of the robots that have it
 # engine -> largest error of qpos, qvel, reward, obs; share of rows that may be over
 TOLERANCES = {"mujoco": (2e-5, 5e-4, 5e-4, 1e-3, 0.002), "mjx": (5e-5, 5e-3, 1e-3, 2e-3, 0.01)}
 TOLERANCES["fused"] = TOLERANCES["warp"] = TOLERANCES["mujoco"]

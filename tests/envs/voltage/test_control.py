@@ -14,7 +14,7 @@ import pytest
 import envs
 from envs.errors import TaskError
 from envs.voltage import profiles
-from places import DATA, ROOT
+from paths import DATA, ROOT
 
 FOLDER = DATA / "mapdn_format_case33"
 ROWS_A_DAY = 480
@@ -338,18 +338,18 @@ def test_the_141_bus_net_needs_its_own_folder() -> None:
 
 @pytest.mark.full
 def test_baselines_order_as_they_should() -> None:
-    from envs.voltage.baselines import POLICIES
+    from envs.voltage.baselines import CONTROLLERS
     from pmt_jax.learning.evaluation import play
 
     env = envs.make("voltage_33", episode_limit=11)
 
-    policies = [jax.vmap(make(env)) for make in POLICIES.values()]
+    policies = [jax.vmap(make(env)) for make in CONTROLLERS.values()]
 
     @jax.jit  # the environment compiles once for all policies
     def figures(number: int) -> dict[str, jax.Array]:
         return {k: x.mean() for k, x in play(env, lambda s, _: jax.lax.switch(number, policies, s), 16).items()}
 
-    found = {name: figures(number) for number, name in enumerate(POLICIES)}
+    found = {name: figures(number) for number, name in enumerate(CONTROLLERS)}
     rate = {name: f["info/totally_controllable_ratio"] for name, f in found.items()}
     loss = {name: f["info/total_line_loss"] for name, f in found.items()}
     assert rate["random"] < rate["zero"] < rate["droop"] <= rate["opf"]

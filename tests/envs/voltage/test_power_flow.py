@@ -11,7 +11,7 @@ import pytest
 
 from envs.errors import TaskError
 from envs.voltage import power_flow
-from places import DATA
+from paths import DATA
 
 RECORDED = DATA / "grid_powerflow_reference.npz"
 CASES = ("case33", pytest.param("case141", marks=pytest.mark.full))

@@ -1,4 +1,4 @@
-"""The process that trains one program of a sweep: `python -m pmt_jax.cli.worker FOLDER OUT CACHE DEVICES`."""
+"""The process that trains one program of a sweep: `python -m pmt_jax.cli.job FOLDER OUT CACHE DEVICES`."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def _end_with_parent() -> None:
 def main() -> int:
     """Trains the program of the arguments."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    folder, out, cache, count = sys.argv[1:]
+    folder, out, cache, given = sys.argv[1:]
 
     def train() -> int:
-        devices = int(count) if count else None
+        devices = int(given) if given else None
         processes.make_room(devices)
         with trusting():  # whoever started this process has checked what its settings name
             return sweep.train_program(pathlib.Path(folder), pathlib.Path(out), bool(int(cache)), say, devices)

@@ -29,9 +29,9 @@ def share_memory() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-def command(folder: pathlib.Path, out: pathlib.Path, cache: bool, count: int | None) -> list[str]:
-    """What a process runs, see `pmt_jax.cli.worker`."""
-    return [sys.executable, "-m", "pmt_jax.cli.worker", str(folder), str(out), str(int(cache)), str(count or "")]
+def command(folder: pathlib.Path, out: pathlib.Path, cache: bool, devices: int | None) -> list[str]:
+    """What a process runs, see `pmt_jax.cli.job`."""
+    return [sys.executable, "-m", "pmt_jax.cli.job", str(folder), str(out), str(int(cache)), str(devices or "")]
 
 
 def gpus() -> tuple[str, ...]:
@@ -43,8 +43,8 @@ def gpus() -> tuple[str, ...]:
     return tuple(named.split(",")) if named else tuple(str(number) for number in range(len(present)))
 
 
-def run(commands: Sequence[Sequence[str]], at_once: int, say: Say, devices: Sequence[str] = ()) -> int:
-    """Runs `commands`, `at_once` at a time, and says what they print with their number in front, from [1].
+def run(commands: Sequence[Sequence[str]], jobs: int, say: Say, devices: Sequence[str] = ()) -> int:
+    """Runs `commands`, `jobs` at a time, and says what they print with their number in front, from [1].
 
     Ctrl-C and SIGTERM reach all that run, which save and end. After one has failed no other is started.
 
@@ -59,7 +59,7 @@ def run(commands: Sequence[Sequence[str]], at_once: int, say: Say, devices: Sequ
     code = passed_on = 0
     with signals.noted() as received:
         while running or (waiting and not code and not received):
-            while waiting and len(running) < at_once and not code and not received:
+            while waiting and len(running) < jobs and not code and not received:
                 process, job = _start(*waiting.pop(0), _least_used(devices, running.values()), say)
                 running[process] = job
             new = received[passed_on:]  # here and not in the handler, which may strike while a process is starting
@@ -80,8 +80,8 @@ class _Job(NamedTuple):
     device: str | None
 
 
-def _least_used(devices: Sequence[str], jobs: Collection[_Job]) -> str | None:
-    return min(devices, key=[job.device for job in jobs].count, default=None)
+def _least_used(devices: Sequence[str], running: Collection[_Job]) -> str | None:
+    return min(devices, key=[job.device for job in running].count, default=None)
 
 
 def _start(number: int, words: list[str], device: str | None, say: Say) -> tuple[subprocess.Popen[str], _Job]:

@@ -1,6 +1,6 @@
 """What task and method pages show of the code itself: observations, actions, options and settings.
 
-Each form is a function from a name, or several joined by +, to Markdown; `bench.render` puts it into a page.
+Each kind is a function from a name, or several joined by +, to Markdown; `bench.render` puts it into a page.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def as_switches(_: str) -> str:
     return markdown(("method", "update", "constraint", "cost signal", "ratio weight"), body)
 
 
-FORMS: dict[str, Callable[[str], str]] = {
+KINDS: dict[str, Callable[[str], str]] = {
     "observation": as_observation,
     "state": as_state,
     "actions": as_actions,

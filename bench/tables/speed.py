@@ -15,10 +15,10 @@ from pmt_jax.formats import markdown
 from pmt_jax.limits import WORST
 
 from ..compare import on_cpu
-from ..records import Report, Row, Rows
+from ..records import Record, Records, Report
 
 Reports = dict[str, Report]
-Figure = Callable[[Row, Rows], float | None]
+Figure = Callable[[Record, Records], float | None]
 NOT_YET = "*Not measured yet.*"
 
 
@@ -36,7 +36,7 @@ def where(report: Report) -> str:
     return textwrap.fill(", ".join(words) + ":", 120, break_on_hyphens=False)
 
 
-def matching(rows: Rows, **wanted: Any) -> Rows:
+def matching(rows: Records, **wanted: Any) -> Records:
     """Those of `rows` that have all these entries; None stands for one that is missing."""
     return [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
 
@@ -45,12 +45,12 @@ def matching(rows: Rows, **wanted: Any) -> Rows:
 # Figures of a row among the other rows of its result
 
 
-def rate(row: Row) -> float | None:
+def rate(row: Record) -> float | None:
     """Environment steps or power flows per second."""
     return row.get("steps_per_second", row.get("flows_per_second"))
 
 
-def ratios(row: Row, other: Row) -> list[float]:
+def ratios(row: Record, other: Record) -> list[float]:
     """The rate over that of another row, turn by turn."""
     ours, theirs = (x.get("rates", ()) for x in (row, other))
     if not ours or len(ours) != len(theirs):
@@ -58,75 +58,75 @@ def ratios(row: Row, other: Row) -> list[float]:
     return [x / y for x, y in zip(ours, theirs, strict=True)]
 
 
-def _over(row: Row, rows: Rows, **reference: Any) -> float | None:
+def _over(row: Record, rows: Records, **reference: Any) -> float | None:
     """The median ratio to the row that is like this one but for `reference`; None if there is no such row."""
     found = [other for other in matching(rows, **reference) if rate(other)]
     return statistics.median(ratios(row, found[0])) if found and rate(row) else None
 
 
-def _of_plain(row: Row, rows: Rows) -> float | None:
+def _of_plain(row: Record, rows: Records) -> float | None:
     ratio = _over(row, rows, kind="plain loop", task=row["task"], threads=1)
     threads = max((other["threads"] for other in matching(rows, kind="plain loop")), default=1)
     return ratio and ratio / threads
 
 
-def _of_plain_per_cpu(row: Row, rows: Rows) -> float | None:
+def _of_plain_per_cpu(row: Record, rows: Records) -> float | None:
     plain = matching(rows, kind="plain loop", task=row["task"], threads=1)
     known = plain and "steps_per_cpu_second" in row and "steps_per_cpu_second" in plain[0]
     return row["steps_per_cpu_second"] / plain[0]["steps_per_cpu_second"] if known else None
 
 
-def _of_plain_on_each_core(row: Row, rows: Rows) -> float | None:
+def _of_plain_on_each_core(row: Record, rows: Records) -> float | None:
     """The rate over the steps that a plain loop makes in a CPU-second, on every core."""
     plain = max(matching(rows, kind="plain loop"), key=lambda loops: loops["threads"], default={})
     return rate(row) / (plain["threads"] * plain["steps_per_cpu_second"]) if plain and rate(row) else None
 
 
-def _of_as_many_loops(row: Row, rows: Rows) -> float | None:
+def _of_as_many_loops(row: Record, rows: Records) -> float | None:
     return _over(row, rows, kind="plain loop")
 
 
-def _times_one_seed(row: Row, rows: Rows) -> float | None:
+def _times_one_seed(row: Record, rows: Records) -> float | None:
     same = {name: row.get(name) for name in ("kind", "task", "method", "physics", "num_envs", "rollout_length")}
     ratio = _over(row, rows, **same, seeds=1) if row.get("seeds", 1) > 1 else None
     return ratio and row["seeds"] / ratio
 
 
-def _of_reference_walls(row: Row, rows: Rows) -> float | None:
+def _of_reference_walls(row: Record, rows: Records) -> float | None:
     same = {name: row.get(name) for name in ("physics", "solver", "num_envs")}
     return _over(row, rows, **same, what="reference")
 
 
-def _of_integral(row: Row, rows: Rows) -> float | None:
+def _of_integral(row: Record, rows: Records) -> float | None:
     return _over(row, rows, task=row["task"], what="integral")
 
 
-def _efficiency(row: Row, rows: Rows) -> float | None:
+def _efficiency(row: Record, rows: Records) -> float | None:
     ratio = _over(row, rows, task=row["task"], what="one device")
     return ratio and ratio / row.get("devices", 1)
 
 
-def _update_seconds(row: Row, rows: Rows) -> float | None:
+def _update_seconds(row: Record, rows: Records) -> float | None:
     if "num_envs" not in row or not rate(row):
         return None
     return row["seeds"] * row["num_envs"] * row["rollout_length"] / row["steps_per_second"]
 
 
-def _times_mappo_l(row: Row, rows: Rows) -> float | None:
+def _times_mappo_l(row: Record, rows: Records) -> float | None:
     ratio = _over(row, rows, task=row["task"], method="mappo_l")
     return ratio and 1 / ratio
 
 
-def _compile_times_mappo_l(row: Row, rows: Rows) -> float | None:
+def _compile_times_mappo_l(row: Record, rows: Records) -> float | None:
     reference = matching(rows, task=row["task"], method="mappo_l")
     return row["compile_seconds"] / reference[0]["compile_seconds"] if reference and "compile_seconds" in row else None
 
 
-def _of_mappo_l(row: Row, rows: Rows) -> float | None:
+def _of_mappo_l(row: Record, rows: Records) -> float | None:
     return _over(row, rows, name="pmt train, MAPPO-L")
 
 
-def _ours(row: Row, rows: Rows) -> list[float]:
+def _ours(row: Record, rows: Records) -> list[float]:
     """Our rate in 32 bits, same network and batch, over that of this row, turn by turn."""
     same = {name: row.get(name) for name in ("kind", "task", "num_envs")}
     ours = [other for other in matching(rows, **same, what="ours f32") if rate(other)]
@@ -137,58 +137,58 @@ def _ours(row: Row, rows: Rows) -> list[float]:
 # Columns
 
 
-def _shown(form: str, found: Figure | str) -> Callable[[Row, Rows], str]:
+def _shown(pattern: str, found: Figure | str) -> Callable[[Record, Records], str]:
     """A column: a figure (or what stands in the row under that name) in some format, `-` if there is none."""
 
-    def cell(row: Row, rows: Rows) -> str:
+    def cell(row: Record, rows: Records) -> str:
         value = row.get(found) if isinstance(found, str) else found(row, rows)
-        return form.format(value) if value is not None else "-"
+        return pattern.format(value) if value is not None else "-"
 
     return cell
 
 
-def _engine(row: Row, rows: Rows) -> str:
+def _engine(row: Record, rows: Records) -> str:
     if row.get("physics", "xla") == "xla":
         return "plain C" if row["kind"] == "plain loop" else "plain JAX"
     return f"`{row['physics']}`" + (f", `solver = {row['solver']}`" if row.get("solver") else "")
 
 
-def _contestant(row: Row, rows: Rows) -> str:
+def _contestant(row: Record, rows: Records) -> str:
     if row["kind"] == "plain loop":
         return f"plain loop, {row['threads']} thread{'s' * (row['threads'] > 1)}"
     return {"environment": "environment alone", "training": f"training, {row.get('method')}"}[row["kind"]]
 
 
-def _rate_or_failure(row: Row, rows: Rows) -> str:
+def _rate_or_failure(row: Record, rows: Records) -> str:
     return f"failed: {row['failed'].split(':')[0]}" if "failed" in row else f"{rate(row):,.0f}"
 
 
-def _turns(name: str) -> Callable[[Row, Rows], str]:
+def _turns(name: str) -> Callable[[Record, Records], str]:
     """The mean over turns of what stands in the row under that name, with the lowest and highest."""
 
-    def cell(row: Row, rows: Rows) -> str:
+    def cell(row: Record, rows: Records) -> str:
         found = row.get(name)
         return f"{statistics.mean(found):.2f} ({min(found):.2f} to {max(found):.2f})" if found else "-"
 
     return cell
 
 
-def _sizes(*names: str) -> Callable[[Row, Rows], str]:
+def _sizes(*names: str) -> Callable[[Record, Records], str]:
     return lambda row, rows: " x ".join(f"{row[name]:,}" for name in names if name in row) or "-"
 
 
-def _of_a_call_a_substep(row: Row, rows: Rows) -> float | None:
+def _of_a_call_a_substep(row: Record, rows: Records) -> float | None:
     same = {name: row.get(name) for name in ("kind", "task", "seeds", "num_envs")}
     return _over(row, rows, what="a substep", **same)
 
 
-def _ours_cell(row: Row, rows: Rows) -> str:
+def _ours_cell(row: Record, rows: Records) -> str:
     found = _ours(row, rows) if row["what"] != "ours f32" else []
     lowest = f" ({min(found):,.2f})" if len(found) > 1 else ""
     return f"{statistics.median(found):,.2f}{lowest}" if found else "-"
 
 
-COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
+COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "program": _shown("{}", "name"),
     "physics": _shown("{}", "physics"),
     "environments x steps": _sizes("num_envs", "rollout_length"),
@@ -217,7 +217,7 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "of reference": _shown("{:.2f}", _of_reference_walls),
     "rule": _shown("{}", "what"),
     "of integral": _shown("{:.3f}", _of_integral),
-    "worker processes": _shown("{}", "jobs"),
+    "worker processes": _shown("{}", "workers"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
     "of plain loops at once": _shown("{:.2f}", _of_as_many_loops),
@@ -275,7 +275,7 @@ class Table(NamedTuple):
         found = [r for name, r in reports.items() if name == self.result or name.startswith(f"{self.result}_")]
         return "\n\n".join(f"{where(report)}\n\n{self._of(report['rows'])}" for report in found) or NOT_YET
 
-    def _of(self, rows: Rows) -> str:
+    def _of(self, rows: Records) -> str:
         shown = [row for row in rows if row["kind"] in self.kinds]
         return markdown(self.columns, ([COLUMNS[name](row, rows) for name in self.columns] for row in shown))
 
@@ -311,8 +311,8 @@ def hub(reports: Reports) -> str:
     return f"{markdown(head, body)}\n\n{len(rows)} policies, {total / 1000:.0f} kB in all."
 
 
-def beside(reports: Reports) -> str:
-    """Speed in five rows, beside what one would use instead, and where and when each was measured."""
+def alternatives(reports: Reports) -> str:
+    """Speed in five rows, next to what one would use instead, and where and when each was measured."""
     ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
     (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
     (alone,) = matching(ant["rows"], kind="environment", physics="mujoco", num_envs=256)
@@ -337,7 +337,7 @@ def beside(reports: Reports) -> str:
 
 
 def limits(reports: Reports) -> str:
-    """Training beside its environment alone, if both were measured at the same size."""
+    """Training next to its environment alone, if both were measured at the same size."""
     ant, engines, loop, scaling = (
         reports[name]["rows"] for name in ("ant", "engines_h200", "loop_h200", "scaling_h200")
     )
@@ -368,7 +368,7 @@ def limits(reports: Reports) -> str:
 
 
 def side_by_side(reports: Reports) -> str:
-    """Five seeds in one program on one GPU, beside one."""
+    """Five seeds in one program on one GPU, next to one."""
     rows = matching(reports["loop_h200"]["rows"], method="mappo_l")
     body = []
     for one in matching(rows, seeds=1):
@@ -466,7 +466,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
     "hub": hub,
-    "beside": beside,
+    "alternatives": alternatives,
     "limits": limits,
     "side_by_side": side_by_side,
     "peers": Table(

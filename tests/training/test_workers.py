@@ -13,15 +13,15 @@ import psutil
 import pytest
 
 from pmt_jax import load_config
-from pmt_jax.training import jobs
+from pmt_jax.training import workers
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, saved
 
-JOBS = ("train", *ARGUMENTS, "--jobs", 2)
+WORKERS = ("train", *ARGUMENTS, "--workers", 2)
 
 
 def begun(out: pathlib.Path, *more: object) -> subprocess.Popen[str]:
     """A run in two workers that has written its first rows and has long to go."""
-    words = [str(word) for word in (*JOBS, "--steps", 10**7, "--out", out, *more)]
+    words = [str(word) for word in (*WORKERS, "--steps", 10**7, "--out", out, *more)]
     command = [sys.executable, "-m", "pmt_jax", *words]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout and any(line.startswith("steps ") for line in process.stdout)
@@ -32,7 +32,7 @@ def begun(out: pathlib.Path, *more: object) -> subprocess.Popen[str]:
 def test_a_workers_seeds_equal_the_run_of_these_seeds_alone(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     """Three seeds in two workers: 0 and 1, and 2."""
     out, alone = tmp_path / "run", tmp_path / "alone"
-    code, text, err = cli("train", *ARGUMENTS, "--seeds", 3, "--jobs", 2, "--steps", STEPS, "--out", out)
+    code, text, err = cli("train", *ARGUMENTS, "--seeds", 3, "--workers", 2, "--steps", STEPS, "--out", out)
     assert (code, err) == (0, "") and "2 worker processes share the seeds and the CPUs" in text
     assert cli("train", *ARGUMENTS, "--seed", 2, "--seeds", 1, "--steps", STEPS, "--out", alone)[0] == 0
     ours = [row | {"seconds": 0} for row in rows(out)]
@@ -45,9 +45,9 @@ def test_a_workers_seeds_equal_the_run_of_these_seeds_alone(whole: pathlib.Path,
 
 @pytest.mark.full
 def test_a_run_goes_on_in_workers(copy: pathlib.Path, cli):
-    code, text, err = cli(*JOBS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    code, text, err = cli(*WORKERS, "--steps", STEPS + 200, "--out", copy, "--resume")
     assert (code, err) == (0, "") and rows(copy)[-1]["step"] == STEPS + 200
-    assert "changed since the run began: jobs 1 -> 2; the run may not continue bit for bit" in text
+    assert "changed since the run began: workers 1 -> 2; the run may not continue bit for bit" in text
 
 
 @pytest.mark.full
@@ -58,10 +58,10 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
         each.send_signal(signal.SIGTERM)
     text, err = process.communicate(timeout=120)
     assert process.returncode == 128 + signal.SIGTERM and not err
-    assert f"--out {tmp_path / 'run'} --resume --jobs 2" in text.splitlines()[-1]
+    assert f"--out {tmp_path / 'run'} --resume --workers 2" in text.splitlines()[-1]
     goal = rows(tmp_path / "run")[-1]["step"] + STEPS // 4
-    assert cli(*JOBS, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
-    assert cli(*JOBS, "--steps", goal, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert cli(*WORKERS, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
+    assert cli(*WORKERS, "--steps", goal, "--out", tmp_path / "uninterrupted")[0] == 0
     assert_same_run(tmp_path / "run", tmp_path / "uninterrupted")
 
 
@@ -72,11 +72,11 @@ def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: path
     text, err = process.communicate(timeout=120)
     said, saved = text.splitlines()[-1], tmp_path / "run-rescued"
     assert process.returncode == 1 and not err and said.startswith(f"stopped: {tmp_path / 'run'} was deleted, renamed")
-    assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --jobs 2")
+    assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --workers 2")
     assert not (tmp_path / "run").exists()
     step = rows(saved)[-1]["step"]
-    assert cli(*JOBS, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
-    assert cli(*JOBS, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert cli(*WORKERS, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
+    assert cli(*WORKERS, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
     assert_same_run(saved, tmp_path / "uninterrupted")
 
 
@@ -92,13 +92,13 @@ def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathli
     assert f"saved as of step {step:,}. Continue with: pmt train" in said
     psutil.wait_procs([first], timeout=60)
     assert not first.is_running()
-    assert cli(*JOBS, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
+    assert cli(*WORKERS, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
 
 
 @pytest.mark.full
 def test_a_worker_says_nothing_when_its_run_ends_with_a_result_unread():
     ours, theirs = Pipe()
-    command = [sys.executable, "-c", jobs.START, str(theirs.fileno())]
+    command = [sys.executable, "-c", workers.START, str(theirs.fileno())]
     streams = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment(), text=True, **streams) as process:
         theirs.close()
@@ -123,10 +123,10 @@ def test_workers_end_with_the_run_that_is_killed(tmp_path: pathlib.Path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--jobs", 3), "--jobs 3 cannot share 2 seed(s); take at most as many jobs as --seeds"),
-        (("--jobs", 0), "--jobs must be a whole number of at least 1, not '0'"),
-        (("--jobs", 2, "--debug"), "--jobs and --debug do not go together; leave one of them out"),
-        (("--jobs", 2, "--devices", 2), "--jobs and --devices do not go together; leave one of them out"),
+        (("--workers", 3), "--workers 3 cannot share 2 seed(s); take at most one a seed"),
+        (("--workers", 0), "--workers must be a whole number of at least 1, not '0'"),
+        (("--workers", 2, "--debug"), "--workers and --debug do not go together; leave one of them out"),
+        (("--workers", 2, "--devices", 2), "--workers and --devices do not go together; leave one of them out"),
     ],
 )
 def test_mistakes(arguments: tuple[object, ...], said: str, cli, tmp_path: pathlib.Path):

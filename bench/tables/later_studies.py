@@ -1,7 +1,7 @@
-"""The tables of the study's second and third rounds: cells beside the one they are compared with, candidates beside
+"""The tables of the study's second and third studys: cells with the one they are compared with, variants next to
 their criteria.
 
-Cells are read at a common update, as the preregistration says: in the second round the last that all cells of the task
+Cells are read at a common update, as the preregistration says: in the second study the last that all cells of the task
 reached, in the third the last that the cells of a comparison reached.
 """
 
@@ -17,6 +17,7 @@ from pmt_jax.config.settings import Config
 from pmt_jax.studies.statistics import holm, iqm, probability_of_improvement, u_test
 
 from . import runs
+from .speed import markdown
 from .study import (
     NAMES,
     Scores,
@@ -32,7 +33,6 @@ from .study import (
     unsafe,
     welch,
 )
-from .tables import markdown
 
 Read = Callable[[Sequence[runs.Run]], list[dict[str, Scores]]]
 
@@ -61,7 +61,7 @@ def _environments(run: runs.Run) -> int:
 
 
 def as_second(file: pathlib.Path) -> str:
-    """The second round: a row a cell; p corrected over the comparisons of one task with F4SG as it is."""
+    """The second study: a row a cell; p corrected over the comparisons of one task with F4SG as it is."""
     found = sorted(runs.load(file), key=lambda run: (run["task"], -share(run), -list(NAMES).index(run["method"])))
     body = []
     for task in dict.fromkeys(run["task"] for run in found):
@@ -86,29 +86,29 @@ def _fear_as_it_is(cells: Sequence[runs.Run], run: runs.Run) -> int:
     return cells.index(_cell(cells, run["task"], share(run), **AS_IT_IS))
 
 
-def as_candidate(file: pathlib.Path) -> str:
-    """Question b in the second round: candidate C against each criterion of the preregistration."""
+def as_variant(file: pathlib.Path) -> str:
+    """Question b in the second study: variant C against each criterion of the preregistration."""
     found = runs.load(file)
     body = _while_training(found, ("voltage_33", "hand_over_2x6"), C, among=found)
     body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), C, among=found)
-    return _as_criteria(body, "candidate C")
+    return _as_criteria(body, "variant C")
 
 
-def as_candidate_late(file: pathlib.Path) -> str:
-    """Candidate C of the second round on the ant, read at the last update of the three cells; an exploration."""
-    return _as_criteria(_at_the_end(runs.load(file), (("ant_2x4", 0.03),), C), "candidate C, read later")
+def as_variant_late(file: pathlib.Path) -> str:
+    """Variant C of the second study on the ant, read at the last update of the three cells; an exploration."""
+    return _as_criteria(_at_the_end(runs.load(file), (("ant_2x4", 0.03),), C), "variant C, read later")
 
 
-def as_candidate_a(file: pathlib.Path) -> str:
-    """Question b in the third round: candidate A against the same criteria, beside cells of the second round."""
+def as_variant_a(file: pathlib.Path) -> str:
+    """Question b in the third study: variant A against the same criteria, next to cells of the second study."""
     found = [run for run in runs.load(file) if settings(run)["emotion_lr"] == A["emotion_lr"]] + _second(file)
     body = _while_training(found, ("voltage_33", "hand_over_2x6"), A)
     body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), A)
-    return _as_criteria(body, "candidate A")
+    return _as_criteria(body, "variant A")
 
 
-def as_candidate_half_life(file: pathlib.Path) -> str:
-    """Question b in the third round: candidate C on the grid with a half-life, and what the half-life alone does."""
+def as_variant_half_life(file: pathlib.Path) -> str:
+    """Question b in the third study: variant C on the grid with a half-life, and what the half-life alone does."""
     found = runs.load(file)
     body = _while_training(found, ("voltage_33",), C, lr_half_life=2e5)
     body += _at_the_end(found, (("voltage_33", 0.05),), C, lr_half_life=2e5)
@@ -122,52 +122,52 @@ def as_candidate_half_life(file: pathlib.Path) -> str:
         p = u_test(halving[name], without[name])
         worse = p < 0.05 and sign * (halving[name].mean() - without[name].mean()) > 0
         text = f"{mean_sd(halving[name])}; {mean_sd(without[name])}; p {p_value(p)}"
-        body.append(["4", f"MAPPO-L's {what} at the end, beside a constant learning rate's, p = 1", text, not worse])
+        body.append(["4", f"MAPPO-L's {what} at the end, against a constant learning rate's, p = 1", text, not worse])
     return _as_criteria(body, "with `lr_half_life` 2e5")
 
 
-def as_candidate_d(file: pathlib.Path) -> str:
-    """Question b in the fourth round: candidate D, fast in its first updates only, against the same criteria."""
+def as_variant_d(file: pathlib.Path) -> str:
+    """Question b in the fourth study: variant D, fast in its first updates only, against the same criteria."""
     found = runs.load(file)
     body = _while_training(found, ("voltage_33", "hand_over_2x6"), D)
     body += _at_the_end(found, (("ant_2x4", 0.03), ("voltage_33", 0.05)), D)
-    return _as_criteria(body, "candidate D")
+    return _as_criteria(body, "variant D")
 
 
 def as_fourth(file: pathlib.Path) -> str:
-    """Cells of the fourth and the sixth round, those of one task and p beside MAPPO-L; question f has its own table."""
+    """Cells of the fourth and the sixth study, those of one task and p next to MAPPO-L, without question f."""
     found = [run for run in runs.load(file) if run["task"] != "ant_4x2"]
     groups = dict.fromkeys((run["task"], share(run)) for run in found)
     cells = [[run for run in found if (run["task"], share(run)) == group] for group in groups]
-    return beside([_first(same, method="mappo_l") for same in cells])
+    return compared([_first(same, method="mappo_l") for same in cells])
 
 
 def as_fifth(file: pathlib.Path) -> str:
-    """Question b in the fifth round: criterion 1 on the grid, over the seeds of the fourth round and of this one."""
-    rounds = [runs.load(file.with_name("study_fourth_h200.json")), runs.load(file)]
-    candidate, base = (
-        pooled([_read([_cell(found, "voltage_33", 1.0, **cell)])[0] for found in rounds])
+    """Question b in the fifth study: criterion 1 on the grid, over the seeds of the fourth study and of this one."""
+    both = [runs.load(file.with_name("study_fourth_h200.json")), runs.load(file)]
+    variant, base = (
+        pooled([_read([_cell(found, "voltage_33", 1.0, **cell)])[0] for found in both])
         for cell in ({"method": "f4sg", **D}, {"method": "mappo_l"})
     )
-    return _as_criteria([_lag("voltage_33", candidate, base)], "candidate D, 80 seeds")
+    return _as_criteria([_lag("voltage_33", variant, base)], "variant D, 80 seeds")
 
 
 def as_power(file: pathlib.Path) -> str:
-    """Question f: F4SG beside MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
-    return beside([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
+    """Question f: F4SG against MAPPO-L on the ant 4x2, 30 seeds, at the last update that both reached."""
+    return compared([_first([run for run in runs.load(file) if run["task"] == "ant_4x2"], method="mappo_l")])
 
 
 def _while_training(
     found: Sequence[runs.Run],
     tasks: Sequence[str],
-    candidate: dict[str, Any],
+    variant: dict[str, Any],
     among: Sequence[runs.Run] = (),
     **more: Any,
 ) -> list:
     """Criterion 1: true cost while training within 1 of MAPPO-L's in 1,000 steps, its interval below 5."""
     body = []
     for task in tasks:
-        cells = [_cell(found, task, 1.0, method="f4sg", **candidate, **more)]
+        cells = [_cell(found, task, 1.0, method="f4sg", **variant, **more)]
         cells.append(_cell(found, task, 1.0, method="mappo_l", **more))
         body.append(_lag(task, *_read(cells, [run for run in among if run["task"] == task])))
     return body
@@ -182,14 +182,14 @@ def _lag(task: str, own: dict[str, Scores], base: dict[str, Scores]) -> list:
 def _at_the_end(
     found: Sequence[runs.Run],
     where: Sequence[tuple[str, float]],
-    candidate: dict[str, Any],
+    variant: dict[str, Any],
     among: Sequence[runs.Run] = (),
     **more: Any,
 ) -> list:
     """Criteria 2 and 3: true cost no worse than F4SG's as it is and below MAPPO-L's, reward nearly F4SG's."""
     body = []
     for task, seen in where:
-        wanted = ({"method": "f4sg", **candidate}, AS_IT_IS, {"method": "mappo_l", "lambda_kp": 0.0})
+        wanted = ({"method": "f4sg", **variant}, AS_IT_IS, {"method": "mappo_l", "lambda_kp": 0.0})
         cells = [_cell(found, task, seen, **cell, **more) for cell in wanted]
         own, usual, base = _read(cells, [run for run in among if run["task"] == task])
         at = f"`{task}`, p = {seen:g}"
@@ -197,7 +197,7 @@ def _at_the_end(
         above, below = u_test(own["end"], usual["end"]), u_test(own["end"], base["end"])
         worse = above < 0.05 and probability_of_improvement([own["end"]], [usual["end"]]) > 0.5
         what = f"{ends[0]}; {ends[1]}; p {p_value(above)}"
-        body.append(["2", f"true cost at the end beside F4SG's, {at}", what, not worse])
+        body.append(["2", f"true cost at the end against F4SG's, {at}", what, not worse])
         what = f"{ends[0]}; {ends[2]}; p {p_value(below)}"
         lower = below < 0.01 and probability_of_improvement([own["end"]], [base["end"]]) < 0.5
         body.append(["2", f"true cost at the end below MAPPO-L's, {at}", what, lower])
@@ -214,26 +214,26 @@ def _as_criteria(body: list, name: str) -> str:
 
 
 def as_lag_in_time(file: pathlib.Path) -> str:
-    """Question b: fear of costly and of other steps on the hands in the first updates, as it is and candidate A's."""
+    """Question b: fear of costly and of other steps on the hands in the first updates, as it is and variant A's."""
     cells = [_cell(_second(file), "hand_over_2x6", 1.0, **AS_IT_IS), _cell(runs.load(file), "hand_over_2x6", 1.0, **A)]
     updates = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24)  # one point of the curves each
     body = []
     for run in cells:
-        for name, what in (("on_costly", "a step felt as costly"), ("on_safe", "others")):
+        for name, what in (("on_costly", "a step observed as costly"), ("on_safe", "others")):
             found = run["diagnostics"][f"fear/{name}"]
             body.append([label(run, cells), what, *(f"{found[update - 1]:.2f}" for update in updates)])
     return markdown(["method", "mean fear of", *(f"update {update}" for update in updates)], body)
 
 
 def as_half_life(file: pathlib.Path) -> str:
-    """Question b in the third round: a half-life on the grid, beside MAPPO-L with it at the same p."""
+    """Question b in the third study: a half-life on the grid, next to MAPPO-L with it at the same p."""
     found = [run for run in runs.load(file) if settings(run)["lr_half_life"] == 2e5]
     groups = [[x for x in found if share(x) == seen] for seen in (1.0, 0.05)]
-    return beside([_first(cells, method="mappo_l") for cells in groups])
+    return compared([_first(cells, method="mappo_l") for cells in groups])
 
 
 def as_batch(file: pathlib.Path) -> str:
-    """Question a in the third round: MAPPO-L with four times the environments, beside the first and the second round.
+    """Question a in the third study: MAPPO-L with four times the environments, next to the first and the second study.
 
     Rows are read at the same number of updates, so the larger batch has had four times the steps.
     """
@@ -241,61 +241,61 @@ def as_batch(file: pathlib.Path) -> str:
     first = runs.load(file.with_name("study_ant_2x4_h200.json"))
     usual = {"method": "mappo_l", "lambda_kp": 0.0, "lambda_init": 2.0}
     pairs = [[_cell(found, "ant_2x4", 0.03, **cell) for cell in (AS_IT_IS, usual)] for found in (_second(file), first)]
-    return beside([[*pair, batch] for pair in pairs])
+    return compared([[*pair, batch] for pair in pairs])
 
 
 def as_sway(file: pathlib.Path) -> str:
-    """Question e: a corridor that moves, seen and hidden; F4SG and R4SG beside MAPPO-L."""
+    """Question e: a corridor that moves, seen and hidden; F4SG and R4SG against MAPPO-L."""
     found = [run for run in runs.load(file) if settings(run)["sway"] != "none"]
     groups = [[x for x in found if settings(x)["sway"] == sway] for sway in ("seen", "hidden")]
-    return beside([_first(cells, method="mappo_l") for cells in groups])
+    return compared([_first(cells, method="mappo_l") for cells in groups])
 
 
 def as_responses(file: pathlib.Path) -> str:
-    """Question c under noise: the variants of R4SG on the grid beside MAPPO-L of the second round."""
+    """Question c under noise: the variants of R4SG on the grid against MAPPO-L of the second study."""
     variants = [run for run in runs.load(file) if run["method"] == "r4sg" and run["task"] == "voltage_33"]
-    return beside([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
+    return compared([[_cell(_second(file), "voltage_33", 0.05, method="mappo_l"), *variants]])
 
 
 def as_prior(file: pathlib.Path) -> str:
-    """Question d: F4SG with the fear of another task from the first step on, beside F4SG that starts afresh."""
-    return beside([_prior_last(file)])
+    """Question d: F4SG with the fear of another task from the first step on, next to F4SG that starts afresh."""
+    return compared([_prior_last(file)])
 
 
 def as_prior_in_time(file: pathlib.Path) -> str:
-    """Question d: fear of the steps that are felt as costly, and true cost, in each tenth of the run; seeds' means."""
+    """Question d: fear of the steps observed as costly, and true cost, in each tenth of the run; seeds' means."""
     body = []
     for run in _prior_last(file):
         fear = run["diagnostics"]["fear/on_costly"]
         cost = 1000 * np.nanmean(np.array(run["true_step_cost"], float), axis=0)
         name = label(run, _prior_last(file))
-        body.append([name, "fear of a step felt as costly", *(f"{x:.2f}" for x in fear)])
+        body.append([name, "fear of a step observed as costly", *(f"{x:.2f}" for x in fear)])
         body.append([name, "true cost per 1,000 steps", *(f"{x:.0f}" for x in cost)])
     return markdown(["method", "mean", *(f"to {x / 1e6:.1f} M" for x in run["steps"])], body)
 
 
-def as_beside_mappo_l(file: pathlib.Path) -> str:
-    """All cells of a file beside MAPPO-L, at the last update that all of them reached."""
-    return beside([_first(runs.load(file), method="mappo_l")])
+def as_against_mappo_l(file: pathlib.Path) -> str:
+    """All cells of a file next to MAPPO-L, at the last update that all of them reached."""
+    return compared([_first(runs.load(file), method="mappo_l")])
 
 
-def as_beside_f4sg(file: pathlib.Path) -> str:
-    """All cells of a file beside F4SG, at the last update that all of them reached."""
-    return beside([_first(runs.load(file), method="f4sg")])
+def as_against_f4sg(file: pathlib.Path) -> str:
+    """All cells of a file next to F4SG, at the last update that all of them reached."""
+    return compared([_first(runs.load(file), method="f4sg")])
 
 
 def as_unclipped(file: pathlib.Path) -> str:
-    """Limits: cells without a clip on cost values beside those of the same method, rule and limit with it."""
+    """Limits: cells without a clip on cost values next to those of the same method, rule and limit with it."""
     return _beside_their_like(file, "limits_pid_h200", "limits_control_h200", "limits_macpo_02_h200")
 
 
 def as_less_noise(file: pathlib.Path) -> str:
-    """Limits: cells with less noise at the end beside those of the same method, rule and limit without it."""
+    """Limits: cells with less noise at the end next to those of the same method, rule and limit without it."""
     return _beside_their_like(file, "limits_unclipped_h200")
 
 
 def as_after_less_noise(file: pathlib.Path) -> str:
-    """Limits: cells of a later form beside those of less noise, each at its own end."""
+    """Limits: cells of a later setting next to those of less noise, each at its own end."""
     return _beside_their_like(file, "limits_less_noise_h100", read=_at_their_ends)
 
 
@@ -319,7 +319,7 @@ def as_noise_in_time(file: pathlib.Path) -> str:
 
 
 def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> str:
-    """Each cell of `file` beside the one of the files `names` that has its method, multiplier's rule and limit.
+    """Each cell of `file` next to the one of the files `names` that has its method, multiplier's rule and limit.
 
     One without its like is alone.
     """
@@ -329,14 +329,14 @@ def _beside_their_like(file: pathlib.Path, *names: str, read: Read = _read) -> s
         return run["method"], settings(run)["lambda_rule"], run["cost_limit"]
 
     like = {cell(run): run for run in found}
-    return beside([[*filter(None, [like.get(cell(run))]), run] for run in runs.load(file)], read)
+    return compared([[*filter(None, [like.get(cell(run))]), run] for run in runs.load(file)], read)
 
 
 def _prior_last(file: pathlib.Path) -> list[runs.Run]:
     return sorted(runs.load(file), key=lambda run: bool(settings(run)["init_fear"]))
 
 
-def beside(groups: Sequence[Sequence[runs.Run]], read: Read = _read) -> str:
+def compared(groups: Sequence[Sequence[runs.Run]], read: Read = _read) -> str:
     """A row a cell; those of a group are compared with its first, p corrected over all groups for each measure.
 
     Groups of several tasks have a column for the task.
@@ -364,7 +364,7 @@ def _second(file: pathlib.Path) -> list[runs.Run]:
 
 
 def _cell(found: Sequence[runs.Run], task: str, seen: float, **wanted: Any) -> runs.Run:
-    """The first run of the task, of this share of felt costs, with these settings."""
+    """The first run of the task, of this share of observed costs, with these settings."""
     wanted |= {"cost_seen": seen}
     return next(run for run in found if run["task"] == task and settings(run).items() >= wanted.items())
 
@@ -374,26 +374,26 @@ def _first(cells: Sequence[runs.Run], method: str) -> list[runs.Run]:
     return sorted(cells, key=lambda run: run["method"] != method)
 
 
-FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "second": as_second,
-    "candidate": as_candidate,
-    "candidate_late": as_candidate_late,
-    "candidate_a": as_candidate_a,
-    "candidate_half_life": as_candidate_half_life,
+    "variant": as_variant,
+    "variant_late": as_variant_late,
+    "variant_a": as_variant_a,
+    "variant_half_life": as_variant_half_life,
     "lag_in_time": as_lag_in_time,
     "half_life": as_half_life,
     "larger_batch": as_batch,
     "sway": as_sway,
     "responses": as_responses,
-    "candidate_d": as_candidate_d,
+    "variant_d": as_variant_d,
     "fourth": as_fourth,
     "fifth": as_fifth,
     "sixth": as_fourth,
     "power": as_power,
     "prior": as_prior,
     "prior_in_time": as_prior_in_time,
-    "beside_mappo_l": as_beside_mappo_l,
-    "beside_f4sg": as_beside_f4sg,
+    "against_mappo_l": as_against_mappo_l,
+    "against_f4sg": as_against_f4sg,
     "unclipped": as_unclipped,
     "less_noise": as_less_noise,
     "after_less_noise": as_after_less_noise,

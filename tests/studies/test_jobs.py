@@ -13,9 +13,9 @@ import types
 
 import pytest
 
-from places import ROOT
+from paths import ROOT
 from pmt_jax.policies import load
-from pmt_jax.studies import workers
+from pmt_jax.studies import jobs
 from pmt_jax.training import checkpoint
 
 
@@ -42,7 +42,7 @@ def test_so_many_at_a_time_and_no_more(tmp_path: pathlib.Path):
         (here / f"ended-{{os.getpid()}}").touch()
     """)
     said: list[str] = []
-    assert workers.run([meeting] * 5, 2, said.append) == 0
+    assert jobs.run([meeting] * 5, 2, said.append) == 0
     assert sorted(line.split()[0] for line in said) == [f"[{i}]" for i in range(1, 6)]
     assert max(int(line.split()[1]) for line in said) == 2
 
@@ -57,36 +57,36 @@ def test_programs_are_spread_over_the_gpus(tmp_path: pathlib.Path, monkeypatch: 
         print(mine)
     """)
     said: list[str] = []
-    assert workers.run([meeting] * 4, 4, said.append, ("3", "5")) == 0
+    assert jobs.run([meeting] * 4, 4, said.append, ("3", "5")) == 0
     assert sorted(line.split()[1] for line in said) == ["3", "3", "5", "5"]
-    assert workers.gpus() == ()  # a CPU is shared as it is
+    assert jobs.gpus() == ()  # a CPU is shared as it is
     gpu = types.SimpleNamespace(platform="gpu")
-    monkeypatch.setattr(workers.jax, "local_devices", lambda: [gpu, gpu])
+    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu, gpu])
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert workers.gpus() == ("0", "1")
+    assert jobs.gpus() == ("0", "1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,GPU-7")
-    assert workers.gpus() == ("2", "GPU-7")
-    monkeypatch.setattr(workers.jax, "local_devices", lambda: [gpu])
-    assert workers.gpus() == ()
+    assert jobs.gpus() == ("2", "GPU-7")
+    monkeypatch.setattr(jobs.jax, "local_devices", lambda: [gpu])
+    assert jobs.gpus() == ()
 
 
 def test_after_a_failure_no_other_is_started_and_those_that_run_go_on():
     said: list[str] = []
     slow = program("import time; time.sleep(2); print('done')")
-    assert workers.run([program("raise SystemExit(3)"), slow, program("print('never')")], 2, said.append) == 3
+    assert jobs.run([program("raise SystemExit(3)"), slow, program("print('never')")], 2, said.append) == 3
     assert said == ["[2] done"]
 
 
 WAITING = """
 import pathlib, signal, sys, threading, time
-from pmt_jax.cli import worker
+from pmt_jax.cli import job
 file = pathlib.Path(sys.argv[1])
 def end(number, _):
     file.write_text(str(number))
     sys.exit(128 + number)
 signal.signal(signal.SIGINT, end)
 signal.signal(signal.SIGTERM, end)
-threading.Thread(target=worker._end_with_parent, daemon=True).start()
+threading.Thread(target=job._end_with_parent, daemon=True).start()
 file.write_text("ready")
 while True:
     time.sleep(0.05)
@@ -104,8 +104,8 @@ while True:
 def test_programs_end_with_the_one_that_started_them(tmp_path: pathlib.Path, sent: int, heard: int):
     files = [tmp_path / "one", tmp_path / "two"]
     commands = [[sys.executable, "-c", WAITING, str(file)] for file in files]
-    script = "import sys; from pmt_jax.studies import workers; "
-    script += f"sys.exit(workers.run({commands!r} + [['never']], 2, print))"
+    script = "import sys; from pmt_jax.studies import jobs; "
+    script += f"sys.exit(jobs.run({commands!r} + [['never']], 2, print))"
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
     until(lambda: all(file.exists() and file.read_text() == "ready" for file in files))
     os.kill(parent.pid, sent)

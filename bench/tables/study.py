@@ -1,6 +1,6 @@
-"""The tables of docs/results/study.md: stored runs of seldom felt costs, read as the preregistration says.
+"""The tables of docs/results/study.md: stored runs of seldom observed costs, read as the preregistration says.
 
-Those of the later rounds are in rounds.py.
+Those of the later studies are in later_studies.py.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pmt_jax.studies.statistics import difference_interval, holm, iqm, iqm_inter
 
 from .. import records
 from . import runs
-from .tables import markdown, matching
+from .speed import markdown, matching
 
 Scores = NDArray[np.float64]  # [seeds]
 
@@ -58,9 +58,9 @@ def measures(run: runs.Run, until: float = np.inf) -> dict[str, Scores]:
     }
 
 
-def pooled(rounds: Sequence[dict[str, Scores]]) -> dict[str, Scores]:
-    """The measures of the seeds of several rounds together."""
-    return {name: np.concatenate([scores[name] for scores in rounds]) for name in rounds[0]}
+def pooled(studies: Sequence[dict[str, Scores]]) -> dict[str, Scores]:
+    """The measures of the seeds of several studies together."""
+    return {name: np.concatenate([scores[name] for scores in studies]) for name in studies[0]}
 
 
 def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
@@ -68,8 +68,8 @@ def label(run: runs.Run, among: Sequence[runs.Run]) -> str:
     name = NAMES[run["method"]]
     mine = settings(run)
     differing = [
-        form.format(f"{mine[key]:g}" if isinstance(mine[key], float) else mine[key])
-        for key, form in SHOWN.items()
+        pattern.format(f"{mine[key]:g}" if isinstance(mine[key], float) else mine[key])
+        for key, pattern in SHOWN.items()
         if mine[key] != ""
         and any(repr(settings(x)[key]) != repr(mine[key]) for x in among if x["method"] == run["method"])
     ]
@@ -133,9 +133,9 @@ def _fear_beside(found: Sequence[runs.Run], run: runs.Run) -> int:
 
 
 def as_lag(file: pathlib.Path) -> str:
-    """Questions b and c, second part: each cell beside the reference cells, with Welch's interval of the difference.
+    """Questions b and c, second part: each cell against the reference cells, with Welch's interval of the difference.
 
-    Cells of question a that belong to it are read up to the last step of the cell beside them.
+    Cells of question a that belong to it are read up to the last step of the cell next to them.
     """
     new = runs.load(file)
     until = {run["task"]: max(run["steps"]) for run in new}
@@ -185,12 +185,12 @@ def welch(x: Scores, y: Scores, level: float = 0.95) -> tuple[float, float]:
 
 
 def as_equivalence(file: pathlib.Path) -> str:
-    """Question c, first part: R4SG less MAPPO-L at p = 1, beside half of MAPPO-L's standard deviation."""
+    """Question c, first part: R4SG less MAPPO-L at p = 1, next to half of MAPPO-L's standard deviation."""
     return _equivalence({run["method"]: measures(run) for run in runs.load(file) if share(run) == 1})
 
 
 def as_equivalence_pooled(files: pathlib.Path) -> str:
-    """Question c on the grid under noise: all seeds of several rounds with the same settings; a + joins files."""
+    """Question c on the grid under noise: all seeds of several studies with the same settings; a + joins files."""
     found = [run for name in files.stem.split("+") for run in runs.load(files.with_stem(name))]
     usual = {"cost_seen": 0.05, "lambda_lr": 12.0, "lambda_init": 0.78, "lambda_kp": 0.0}
     usual |= {"lr_half_life": np.inf, "regret_response": "letter", "kappa": 0.5, "surrogate_weight": 1.0}
@@ -212,7 +212,7 @@ def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
         bound = float(cells["mappo_l"][measure].std(ddof=1)) / 2
         inside = abs(middle) + half <= bound
         p = u_test(cells["r4sg"][measure], cells["mappo_l"][measure])
-        answer = "equivalent" if inside else "different" if p < 0.05 else "not told apart"
+        answer = "equivalent" if inside else "different" if p < 0.05 else "not distinguished"
         body.append(
             [name, f"{middle:+.2f} [{middle - half:.2f}, {middle + half:.2f}]", f"+- {bound:.2f}", p_value(p), answer]
         )
@@ -220,7 +220,7 @@ def _equivalence(cells: Mapping[str, dict[str, Scores]]) -> str:
 
 
 def as_probe(file: pathlib.Path) -> str:
-    """Probes of F4SG beside MAPPO-L with the same settings, at the same p and limit.
+    """Probes of F4SG against MAPPO-L with the same settings, at the same p and limit.
 
     p of each comparison is corrected over all comparisons of the file, those of the three measures together.
     """
@@ -292,8 +292,8 @@ def as_weights(file: pathlib.Path) -> str:
 def as_why(file: pathlib.Path) -> str:
     """What the policy learned from: how well the cost critic explains its targets, how fear tells danger from safety.
 
-    Means over seeds and over the chunks of the first and of the second half of training. Targets are felt costs, with
-    F4SG and Mixed fear.
+    Means over seeds and over the chunks of the first and of the second half of training. Targets are observed
+    costs, with F4SG and Mixed fear.
     """
     body = []
     every = sorted(runs.load(file), key=lambda run: (-share(run), list(NAMES).index(run["method"])))
@@ -310,12 +310,12 @@ def as_why(file: pathlib.Path) -> str:
         )
         body.append([*line, *shown])
     head = ["p", "method", "explained variance of the cost critic, first half", "second half"]
-    head += ["fear of a step that is felt as costly", "of others", "ratio", "calibration error (ECE)"]
+    head += ["fear of a step that is observed as costly", "of others", "ratio", "calibration error (ECE)"]
     return markdown(head, body)
 
 
 def as_noise(file: pathlib.Path) -> str:
-    """Noise of the cost advantage with the critic's values set aside: of felt costs and of fear, a row for each p.
+    """Noise of the cost advantage with the critic's values set aside: of observed costs and of fear, a row for each p.
 
     Means and standard deviations over seeds; docs/figures/noise.py defines the measures.
     """
@@ -327,21 +327,21 @@ def as_noise(file: pathlib.Path) -> str:
 
     columns = [(measure, signal) for measure in ("noise_share", "correlation") for signal in ("cost", "fear")]
     shares = dict.fromkeys(row["p"] for row in rows)
-    head = ["p", "noise share, felt cost", "noise share, fear"]
-    head += ["correlation with the advantage of the true cost, felt cost", "the same, fear"]
+    head = ["p", "noise share, observed cost", "noise share, fear"]
+    head += ["correlation with the advantage of the true cost, observed cost", "the same, fear"]
     return markdown(head, [[f"{p:g}", *(cell(p, *column) for column in columns)] for p in shares])
 
 
 def mean_sd(x: Scores) -> str:
-    form = ".0f" if abs(x.mean()) >= 100 else ".1f"
-    return f"{x.mean():{form}} +- {x.std(ddof=1):{form}}"
+    spec = ".0f" if abs(x.mean()) >= 100 else ".1f"
+    return f"{x.mean():{spec}} +- {x.std(ddof=1):{spec}}"
 
 
 def p_value(value: float) -> str:
     return "< .001" if value < 0.001 else f"{value:.3f}".lstrip("0") if value < 1 else "1"
 
 
-FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "study": as_study,
     "lag": as_lag,
     "equivalence": as_equivalence,

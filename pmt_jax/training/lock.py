@@ -1,8 +1,8 @@
-"""One process at a time in a folder: a file `.claim` names the process that trains there.
+"""One process at a time in a folder: a file `.lock` names the process that trains there.
 
 On one host the file is locked, and the lock ends with its process, however that ends. Locks may not reach other hosts,
 so there the name in the file counts. The open file also tells whether the folder at a path is still the one that was
-claimed: a folder that was deleted, renamed or replaced has no such file, or another one.
+locked: a folder that was deleted, renamed or replaced has no such file, or another one.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 from ..errors import UsageError
 from ..files import is_open_at
 
-NAME = ".claim"
+NAME = ".lock"
 
 
 class Gone(UsageError):
     """A folder was deleted, renamed or replaced while this process worked in it."""
 
 
-class _Claim(NamedTuple):
-    """A claim of this process: the absolute path of its file, the open file, and whether the folder was made for it."""
+class _Lock(NamedTuple):
+    """A lock of this process: the absolute path of its file, the open file, and whether the folder was made for it."""
 
     path: pathlib.Path
     file: int
@@ -39,17 +39,17 @@ class _Claim(NamedTuple):
         return is_open_at(self.file, self.path)
 
 
-_held: dict[pathlib.Path, _Claim] = {}  # by folder, as its path was given
+_held: dict[pathlib.Path, _Lock] = {}  # by folder, as its path was given
 
 
 @contextlib.contextmanager
-def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
+def acquire(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
     """Keeps other processes out of `folder` until the end of the block.
 
     A folder that is not there is made. Made here, or `created` for this, it is removed if it stays empty.
 
     Raises:
-      UsageError: another process has claimed it, or it cannot be written.
+      UsageError: another process has it, or it cannot be written.
     """
     path = folder.absolute() / NAME
     try:
@@ -60,7 +60,7 @@ def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
         if _may_be_alive(owner, locked):
             os.close(file)
             raise _refusal(folder, owner)
-        _held[folder] = _Claim(path, file, created)
+        _held[folder] = _Lock(path, file, created)
         _write(file)
     except OSError as error:
         _release(folder)
@@ -72,7 +72,7 @@ def claim(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
 
 
 def is_held(folder: pathlib.Path) -> bool:
-    """Whether this process has claimed `folder`, and it is still the folder at its path.
+    """Whether this process has locked `folder`, and it is still the folder at its path.
 
     Raises:
       OSError: the path cannot be looked up (a network share that is away).
@@ -81,24 +81,24 @@ def is_held(folder: pathlib.Path) -> bool:
 
 
 def release_all() -> None:
-    """Gives all claims of this process up, for an end at once."""
+    """Releases all locks of this process, for an end at once."""
     for folder in list(_held):
         _release(folder)
 
 
 def _release(folder: pathlib.Path) -> None:
     if folder in _held:
-        claim = _held.pop(folder)
+        lock = _held.pop(folder)
         with contextlib.suppress(OSError):
-            if claim.holds:  # another process may have the folder that is there now
-                claim.path.unlink()
-                if claim.created:
-                    claim.path.parent.rmdir()
-        os.close(claim.file)
+            if lock.holds:  # another process may have the folder that is there now
+                lock.path.unlink()
+                if lock.created:
+                    lock.path.parent.rmdir()
+        os.close(lock.file)
 
 
 def _open(folder: pathlib.Path, path: pathlib.Path) -> tuple[int, bool]:
-    """The descriptor of the claim file `path`, and whether it is locked; UsageError if another process has the lock."""
+    """The descriptor of the lock file `path`, and whether the system locks it; UsageError if for another process."""
     import fcntl  # not on every system, and only training needs it
 
     while True:
@@ -118,7 +118,7 @@ def _open(folder: pathlib.Path, path: pathlib.Path) -> tuple[int, bool]:
 
 
 def _read(file: int) -> dict[str, Any]:
-    """Who claimed the folder: pid, host, since; empty if the file is."""
+    """Who locked the folder: pid, host, since; empty if the file is."""
     try:
         owner = json.loads(os.pread(file, 4096, 0))
     except ValueError:

@@ -19,7 +19,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
 from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
-from pmt_jax.studies.rows import Row, in_order, rows
+from pmt_jax.studies.rows import TableRow, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import holm, iqm, mean_interval, u_test
 from pmt_jax.tasks import columns
@@ -35,12 +35,12 @@ DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
 OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 OLD |= {"lambda_rule": "integral", "cost_advantage": "std", "fear_history": "rollout"}  # these are no settings any more
-OLD |= {"regret_mask": "top", "regret_target": "mode"}
+OLD |= {"regret_mask": "top", "regret_target": "mode", "cost_false": 0.0}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
-TRUE = "true cost"  # also of steps that the team did not notice
+TRUE = "true cost"  # also of steps that the learner did not observe
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
@@ -69,7 +69,7 @@ def load(file: pathlib.Path) -> list[Run]:
     try:
         found = json.loads(file.read_text())
         for run in found:
-            _row(run)
+            row_of(run)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file} holds no stored runs ({type(error).__name__}: {error})") from None
     return found
@@ -132,12 +132,12 @@ def curves(run: Run) -> RunLog:
 
 def as_pmt_table(file: pathlib.Path) -> str:
     """The table that `pmt table` makes of the runs, without the sentences below it that say what its figures mean."""
-    return table.render(in_order([_row(run) for run in load(file)]), "markdown").split("\n\n")[0]
+    return table.render(in_order([row_of(run) for run in load(file)]), "markdown").split("\n\n")[0]
 
 
 def as_paper(file: pathlib.Path) -> str:
     """A line a run: mean ± standard deviation over seeds, as the paper has it, then the paper's own figures."""
-    shown = in_order([_row(run) for run in load(file)])
+    shown = in_order([row_of(run) for run in load(file)])
     found = table.summarise(shown)
     measured = [name for name in ("reward", "cost", "CR", "PL") if name in found[0]]
     published = [name for name in measured if any(name in row["paper"] for row in found)]
@@ -177,9 +177,10 @@ def as_overview(files: pathlib.Path) -> str:
     return markdown(["", *(f"`{method}`" for method in methods)], body)
 
 
-def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[Row, str]]:
+def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str]]:
     """{(task, label): a row, and its mean reward / cost and how many seeds keep the limit} of files that a + joins."""
-    found = [row for name in files.stem.split("+") for row in in_order([_row(x) for x in load(files.with_stem(name))])]
+    stored = [load(files.with_stem(name)) for name in files.stem.split("+")]
+    found = [row for each in stored for row in in_order([row_of(run) for run in each])]
     words = [
         f"{number(x['reward']['mean'], ',.4g')} / {number(x['cost']['mean'], '.3g')}, "
         f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
@@ -236,7 +237,7 @@ def as_ran(files: pathlib.Path) -> str:
     for name in files.stem.split("+"):
         found = load(files.with_stem(name))
         held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
-        kept = [beyond <= 0 for run in held for beyond in _row(run).beyond]
+        kept = [beyond <= 0 for run in held for beyond in row_of(run).beyond]
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
         line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
@@ -251,7 +252,7 @@ def as_pairs(file: pathlib.Path) -> str:
 
     A line below the table has the lowest p of each measure with Holm's correction over the pairs.
     """
-    found = in_order([_row(run) for run in load(file)])
+    found = in_order([row_of(run) for run in load(file)])
     p = {of: [[u_test(x.scores[of], y.scores[of]) for y in found] for x in found] for of in ("reward", "cost")}
     body = []
     for i, row in enumerate(found):
@@ -279,11 +280,11 @@ def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     return METHODS[method].constraint == "lagrangian" and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
 
 
-def _row(run: Run) -> Row:
+def row_of(run: Run) -> TableRow:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
     limits = Limits((run["cost_limit"],))
-    return Row(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
+    return TableRow(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
 
 
 def _scores(run: Run) -> dict[str, np.ndarray]:
@@ -331,14 +332,14 @@ def as_method(file: pathlib.Path) -> str:
     for name in HEADLINES:
         found = {run["method"]: run for run in load(file.with_stem(name))}
         for method in dict.fromkeys((file.stem, "mappo_l")):
-            (row,) = table.summarise([_row(found[method])])
+            (row,) = table.summarise([row_of(found[method])])
             line = [f"`{row['task']}`", f"`{method}`"]
             line += [_mean_std(row[figure]["mean"], row[figure]["std"]) for figure in ("reward", "cost")]
             body.append([*line, f"{row['cost_limit']:g}", f"{round(row['within'] * row['seeds'])} of {row['seeds']}"])
     return markdown(("task", "method", "reward", "cost", "limit", "seeds within"), body)
 
 
-FORMS: dict[str, Callable[[pathlib.Path], str]] = {
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "curves": as_pmt_table,
     "points": as_points,
     "mean_actions": as_mean_actions,

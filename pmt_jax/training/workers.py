@@ -29,7 +29,7 @@ from ..learning.types import LearnerState
 from ..output import Say
 from . import failures, processes
 from .checkpoint import pack, unpack
-from .compile import Programs, compile_run, take
+from .compile import Programs, compile_run, where_seed
 from .run_folder import state_like
 from .signals import CAUGHT
 
@@ -40,14 +40,14 @@ SETTINGS = (  # of JAX, which a worker takes over
     "jax_compilation_cache_dir",
     "jax_persistent_cache_min_compile_time_secs",
 )
-START = "from pmt_jax.training import jobs; jobs.serve()"
+START = "from pmt_jax.training import workers; workers.serve()"
 
 
-class Lost(UsageError):
+class WorkerLost(UsageError):
     """A worker process has ended; the sentence says which and how."""
 
 
-def check(config: Config, jobs: int, others: Mapping[str, object]) -> None:
+def check_workers(config: Config, count: int, others: Mapping[str, object]) -> None:
     """Whether so many worker processes can share the run.
 
     Args:
@@ -56,35 +56,35 @@ def check(config: Config, jobs: int, others: Mapping[str, object]) -> None:
     Raises:
       UsageError: they cannot.
     """
-    if jobs == 1:
+    if count == 1:
         return
-    if jobs > config.seeds:
-        raise UsageError(f"--jobs {jobs} cannot share {config.seeds} seed(s); take at most as many jobs as --seeds")
+    if count > config.seeds:
+        raise UsageError(f"--workers {count} cannot share {config.seeds} seed(s); take at most one a seed")
     if given := [flag for flag, value in others.items() if value]:
-        raise UsageError(f"--jobs and {' and '.join(given)} do not go together; leave one of them out")
+        raise UsageError(f"--workers and {' and '.join(given)} do not go together; leave one of them out")
     if jax.process_count() > 1:
-        raise UsageError("--jobs splits a run on one host; these processes split it already: leave out --jobs")
+        raise UsageError("--workers splits a run on one host; these processes split it already: leave out --workers")
     if jax.devices()[0].platform != "cpu":
-        raise UsageError("--jobs shares the cores of a CPU; a GPU trains all seeds in one program: leave out --jobs")
+        raise UsageError("--workers shares the cores of a CPU; a GPU trains all seeds in one program: leave it out")
 
 
-def start(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
-    """As `compile_run`, but the programs run in `setup.jobs` worker processes.
+def start_workers(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
+    """As `compile_run`, but the programs run in `setup.workers` worker processes.
 
     Raises:
-      Lost: a worker ended meanwhile; their programs raise it too.
+      WorkerLost: a worker ended meanwhile; their programs raise it too.
       UsageError: what `compile_run` raises.
     """
     config = setup.config
     say(f"compiling {config.method} on {setup.vector.spec.name} in every worker ...")
     workers = Workers(setup)
     try:
-        states, measures, said = zip(*map(workers.receive, range(setup.jobs)), strict=True)
+        states, measures, said = zip(*map(workers.receive, range(setup.workers)), strict=True)
     except UsageError:
         workers.close()
         raise
     say(said[0])
-    programs = Programs(functools.partial(workers.call, "chunk"), jax.jit(take), close=workers.close)
+    programs = Programs(functools.partial(workers.call, "chunk"), jax.jit(where_seed), close=workers.close)
     if config.eval_interval:
         programs = programs._replace(evaluate=functools.partial(workers.call, "evaluate"), measures=measures[0])
     return workers.together(states), programs
@@ -95,7 +95,7 @@ class Workers:
 
     def __init__(self, setup: Setup) -> None:
         config, self._like = setup.config, state_like(setup)
-        parts = np.array_split(np.arange(config.seeds), setup.jobs)
+        parts = np.array_split(np.arange(config.seeds), setup.workers)
         self._bounds = [(int(part[0]), int(part[-1]) + 1) for part in parts]
         self._first, self._processes, self._pipes = config.seed, [], []
         cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -109,7 +109,7 @@ class Workers:
                 start_new_session=True,  # a terminal's Ctrl-C is for this process alone
             )
             if cpus:
-                processes.take_cpus(process.pid, cpus, rank, setup.jobs)
+                processes.take_cpus(process.pid, cpus, rank, setup.workers)
             theirs.close()  # the worker's end alone is left: where it dies, reading ends
             self._processes.append(process)
             self._pipes.append(ours)
@@ -152,13 +152,13 @@ class Workers:
         except OSError:
             raise self._lost(rank) from None
 
-    def _lost(self, rank: int) -> Lost:
+    def _lost(self, rank: int) -> WorkerLost:
         code = self._processes[rank].wait()
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         first, last = (self._first + i for i in (self._bounds[rank][0], self._bounds[rank][1] - 1))
         seeds = f"seed {first}" if first == last else f"seeds {first} to {last}"
-        advice = " (fewer --jobs need less memory)" if code == -signal.SIGKILL else ""
-        return Lost(f"worker {rank + 1} of {len(self._bounds)} ({seeds}) {how}{advice}")
+        advice = " (fewer --workers need less memory)" if code == -signal.SIGKILL else ""
+        return WorkerLost(f"worker {rank + 1} of {len(self._bounds)} ({seeds}) {how}{advice}")
 
     def close(self) -> None:
         """Ends the workers, which have nothing to save."""
