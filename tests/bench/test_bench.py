@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import multiprocessing
 import pathlib
@@ -351,6 +352,7 @@ def test_the_readme_is_short_and_its_figures_are_made():
 # Stored runs
 
 
+@functools.cache  # nobody changes them
 def stored() -> dict[str, list[runs.Run]]:
     found = {file.stem: json.loads(file.read_text()) for file in sorted(records.RESULTS.glob("*.json"))}
     return {name: x for name, x in found.items() if isinstance(x, list) and "table" in x[0]}
