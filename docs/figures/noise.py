@@ -94,12 +94,12 @@ def measures(drawn: np.ndarray, true: np.ndarray) -> dict[str, float]:
     return {name: float(f"{x:.4g}") for name, x in found.items()}
 
 
-def measure(shares: Sequence[float], seeds: Sequence[int], updates: int) -> records.Rows:
+def measure(shares: Sequence[float], seeds: Sequence[int], updates: int) -> records.Records:
     """A row for each p, seed, signal and choice of values."""
     config = load_config(TASK, method="f4sg", physics="mujoco")
     setup = make_setup(config)
     update, look = (jax.jit(functools.partial(f, setup)) for f in (train_step, advantages))
-    found: records.Rows = []
+    found: records.Records = []
     for p, seed in itertools.product(shares, seeds):
         thinned = dataclasses.replace(config, cost_seen=p, lambda_lr=config.lambda_lr / p)
         hyper = dataclasses.replace(setup, config=thinned).hyper  # the same program for every p

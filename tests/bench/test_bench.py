@@ -358,7 +358,14 @@ def stored() -> dict[str, list[runs.Run]]:
     return {name: x for name, x in found.items() if isinstance(x, list) and "table" in x[0]}
 
 
-GONE = {"lambda_rule", "cost_advantage", "fear_history", "regret_mask", "regret_target"}  # settings that runs have
+GONE = {
+    "cost_false",
+    "lambda_rule",
+    "cost_advantage",
+    "fear_history",
+    "regret_mask",
+    "regret_target",
+}  # settings that runs have
 GONE_OF = {"velocity_entropy_h200": {"std_min"}}  # left the program after its trial (docs/appendix/velocity.md)
 
 
