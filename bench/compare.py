@@ -13,7 +13,7 @@ from .records import Report, Row
 
 LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
-SUBJECT = ("kind", "task", "name", "what", "method", "physics", "solver")
+SUBJECT = ("kind", "task", "name", "what", "method", "physics")
 SIZES = ("threads", "devices", "jobs", "seeds", "num_envs", "rollout_length")
 WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 

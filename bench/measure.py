@@ -23,15 +23,16 @@ import psutil
 
 import envs
 from envs.base import State
-from envs.physics import usable_cpus
+from envs.physics import obstacle, usable_cpus
 from envs.vector import restart
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
 
-from . import grid, once, plain, substep
-from .cases import Bench, Build, Case, Program
+from . import grid, once, plain
+from .cases import Build, Case, Program
+from .compare import label
 from .records import Row
 
 UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
@@ -45,25 +46,33 @@ class Effort(NamedTuple):
     patience: float
 
 
-FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
+# A lent GPU's host is never quiet, and other work on its cores hardly reaches the GPU: no turn waits for a pause there.
+FULL, ON_GPU, QUICK = Effort(5, 1.0, 20.0), Effort(5, 1.0, 0.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 
 
-def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
-    """Measures cases; if one fails, its row says why."""
+def rows(cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Row]:
+    """Measures cases; if one fails, its row says why. A case whose engine cannot run here has no row."""
     found, failed = {}, Failures()
+    cases = [case for case in cases if _can_run(case, say)]
     for case in [case for case in cases if case.kind in ONCE]:
         await_quiet(6 * effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
-    fits = [case for case in cases if case.devices <= jax.device_count() and case.jobs <= max(2, usable_cpus())]
-    timed = [case for case in fits if case.kind not in ONCE]
-    for group in [timed] if bench.by_turns else [[case] for case in timed]:
-        programs = _compiled(group, failed, bench.on == "gpus", say)
-        turns = _take_turns(programs, effort)
-        found |= {case: program.facts | _medians(case, turns[case]) for case, program in programs.items()}
-        for case in group:
-            yield _row(case, found, failed, say)
+    timed = [case for case in cases if case.kind not in ONCE]
+    programs = _compiled(timed, failed, jax.default_backend() == "gpu", say)
+    turns = _take_turns(programs, effort)
+    found |= {case: program.facts | _medians(case, turns[case]) for case, program in programs.items()}
+    for case in timed:
+        yield _row(case, found, failed, say)
+
+
+def _can_run(case: Case, say: Callable[[str], None]) -> bool:
+    """Whether this machine has the devices, the CPUs and the engine; a missing engine is said."""
+    reason = obstacle(case.physics) if case.physics else None
+    if reason:
+        say(f"left out: {label(case.about())}: physics '{case.physics}' {reason}")
+    return reason is None and case.devices <= jax.device_count() and case.jobs <= max(2, usable_cpus())
 
 
 def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[str], None]) -> Row:
@@ -73,7 +82,7 @@ def _row(case: Case, found: dict[Case, Row], failed: Failures, say: Callable[[st
 
 
 def _attempt(failed: Failures, case: Case, work: Callable[[], Any]) -> Any:
-    """What `work` returns; an engine that is missing, or a device without the memory, is a result too."""
+    """What `work` returns; a task that cannot be made, or a device without the memory, is a result too."""
     try:
         return work()
     except Exception as error:
@@ -105,8 +114,8 @@ def _compiled(
 
 def environment(case: Case) -> Build:
     """jit(scan(vmap(step))) with random actions, and with resets if an episode terminates."""
-    named = {"physics": case.physics, "solver": case.solver}
-    env = envs.make(case.task, **{name: word for name, word in named.items() if word}, **dict(case.settings))
+    engine = {"physics": case.physics} if case.physics else {}
+    env = envs.make(case.task, **engine, **dict(case.settings))
     batch = case.seeds * case.num_envs
     step_all, reset_all = jax.vmap(env.step), jax.vmap(env.reset)
 
@@ -173,7 +182,6 @@ ONCE = {
     "checkpoint": once.checkpoint,
     "baseline": once.baseline,
     "certificate": once.certificate,
-    "substep": substep.substep,
 }
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 
