@@ -115,12 +115,6 @@ def _plain(task: str) -> Case:
     return Case("plain loop", task)
 
 
-def _ruled(task: str, *settings: tuple[str, Any]) -> tuple[Case, ...]:
-    pid = (("lambda_kp", 0.5), ("lambda_kd", 0.1))
-    rules = {"integral": (), "pid": pid}
-    return tuple(_training(task, "mappo_l", 1, 64, 64, *settings, *gains, what=rule) for rule, gains in rules.items())
-
-
 def _in_jobs(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
     return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), jobs=count) for count in counts)
 
@@ -219,11 +213,6 @@ BENCHES = {
             *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
-    ),
-    "multiplier": Bench(
-        "the multiplier's rule: steps/s of the whole training loop with the integral and with PID",
-        (*_ruled("ant_2x4", *_BATCH), *_ruled("switch", *_LIKE_THE_ANT)),
-        _ruled("switch", *_LIKE_THE_ANT),
     ),
     "grid": Bench(
         "power flows/s beside other tools; environment steps/s in a scan and with a call a step",

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from .records import Report, Row
 
-LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
+LESS = ("_seconds", "_gb", "_mb")
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
 SUBJECT = ("kind", "task", "name", "what", "method", "physics")
 SIZES = ("threads", "devices", "jobs", "seeds", "num_envs", "rollout_length")
@@ -28,7 +28,7 @@ class Change(NamedTuple):
 
 
 def more_is_better(name: str) -> bool:
-    return name.endswith("_second") or name in SHARES
+    return name.endswith("_second")
 
 
 def label(row: Row) -> str:

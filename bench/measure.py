@@ -8,12 +8,9 @@ notes how much of it went on.
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import dataclasses
 import itertools
-import os
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -191,12 +188,11 @@ MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": 
 
 
 class Turn(NamedTuple):
-    """Steps per second; CPUs that this process and others kept busy; a GPU's busy share, if there is one."""
+    """Steps per second; CPUs that this process and others kept busy."""
 
     rate: float
     cpu: float
     others: float
-    gpu: float | None
 
 
 def _take_turns(programs: dict[Case, Program], effort: Effort) -> dict[Case, list[Turn]]:
@@ -211,17 +207,15 @@ def _take_turns(programs: dict[Case, Program], effort: Effort) -> dict[Case, lis
 
 def _turn(program: Program, seconds: float) -> Turn:
     watch, calls = Watch(), 0
-    with _busy() as busy:
-        while not calls or watch.wall < seconds:
-            program.call()
-            calls += 1
-        wall, others, own = watch.wall, watch.others, watch.own
-    return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
+    while not calls or watch.wall < seconds:
+        program.call()
+        calls += 1
+    wall, others, own = watch.wall, watch.others, watch.own
+    return Turn(calls * program.steps / wall, own / wall, others)
 
 
 def _medians(case: Case, turns: Sequence[Turn]) -> Row:
     unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
-    busy = [turn.gpu for turn in turns if turn.gpu is not None]
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none
     return {
         unit: round(statistics.median(turn.rate for turn in turns), 1),
@@ -229,7 +223,6 @@ def _medians(case: Case, turns: Sequence[Turn]) -> Row:
         "steps_per_cpu_second": round(statistics.median(turn.rate / turn.cpu for turn in turns)),
         "other_work_cpus": round(statistics.median(turn.others for turn in turns), 2),
         **({"memory_gb": round(memory / 1e9, 2)} if memory else {}),
-        **({"gpu_busy": round(statistics.mean(busy), 2)} if busy else {}),
     }
 
 
@@ -270,18 +263,3 @@ def await_quiet(patience: float) -> None:
         time.sleep(0.3)
         if watch.others < 0.1:
             return
-
-
-@contextlib.contextmanager
-def _busy() -> Iterator[list[float]]:
-    """Yields a list that gets a GPU's utilisation, 0 to 1, every 100 ms; it stays empty without one."""
-    found: list[float] = []
-    if jax.devices()[0].platform != "gpu":
-        yield found
-        return
-    used = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]  # nvidia-smi counts all that the machine has
-    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits", "-i", used, "-lms", "100"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        yield found
-        process.terminate()
-        found += [float(line) / 100 for line in process.communicate()[0].splitlines() if line.strip().isdigit()]

@@ -94,10 +94,6 @@ def _of_reference_walls(row: Row, rows: Rows) -> float | None:
     return _over(row, rows, **same, what="reference")
 
 
-def _of_integral(row: Row, rows: Rows) -> float | None:
-    return _over(row, rows, task=row["task"], what="integral")
-
-
 def _efficiency(row: Row, rows: Rows) -> float | None:
     ratio = _over(row, rows, task=row["task"], what="one device")
     return ratio and ratio / row.get("devices", 1)
@@ -161,11 +157,14 @@ def _rate_or_failure(row: Row, rows: Rows) -> str:
 
 
 def _turns(name: str) -> Callable[[Row, Rows], str]:
-    """The mean over turns of what stands in the row under that name, with the lowest and highest."""
+    """The mean over turns of what stands in the row under that name, with the lowest and highest of several."""
 
     def cell(row: Row, rows: Rows) -> str:
         found = row.get(name)
-        return f"{statistics.mean(found):.2f} ({min(found):.2f} to {max(found):.2f})" if found else "-"
+        if not found:
+            return "-"
+        scatter = f" ({min(found):.2f} to {max(found):.2f})" if len(found) > 1 else ""
+        return f"{statistics.mean(found):.2f}{scatter}"
 
     return cell
 
@@ -184,10 +183,8 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "program": _shown("{}", "name"),
     "physics": _shown("{}", "physics"),
     "environments x steps": _sizes("num_envs", "rollout_length"),
-    "epochs x minibatches": _sizes("epochs", "minibatches"),
     "networks; cost": _shown("{}", "networks"),
     "of pmt train, MAPPO-L": _shown("{:.2f}", _of_mappo_l),
-    "other work, CPUs": _shown("{:.1f}", "other_work_cpus"),
     "turns' reward": _turns("rewards"),
     "turns' cost": _turns("costs"),
     "": _contestant,
@@ -206,8 +203,6 @@ COLUMNS: dict[str, Callable[[Row, Rows], str]] = {
     "power flows/s": _rate_or_failure,
     "walls": _shown("{}", "what"),
     "of reference": _shown("{:.2f}", _of_reference_walls),
-    "rule": _shown("{}", "what"),
-    "of integral": _shown("{:.3f}", _of_integral),
     "worker processes": _shown("{}", "jobs"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
@@ -447,7 +442,6 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         ("training",),
         ("task", "method", "compile, s", "compile x MAPPO-L", "update, s", "update x MAPPO-L", "environment steps/s"),
     ),
-    "multiplier": Table("multiplier", ("training",), ("task", "rule", "environment steps/s", "of integral")),
     "power_flows": Table(
         "grid", ("power flow",), ("task", "batch", "what", "power flows/s", "ours f32 is faster by (lowest)")
     ),
@@ -482,9 +476,9 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "peers",
         ("peer",),
         (
-            *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
+            *("program", "task", "physics", "environments x steps", "networks; cost"),
             *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost"),
-            *("first update, s", "other work, CPUs"),
+            "first update, s",
         ),
     ),
 }

@@ -165,7 +165,7 @@ def _options(once: bool = False) -> dict[str, str | bool] | None:
     """XLA's options for a run's programs, and for what runs `once`. Whoever sets a level in XLA_FLAGS gets that.
 
     On a GPU it would time several kernels for every matrix product. That took a quarter of the time to compile, and
-    training was no faster for it (docs/results/speed.md). On a CPU it would optimise the code that draws the first
+    training was no faster for it (docs/appendix/benchmarks.md). On a CPU it would optimise the code that draws the first
     weights and states for longer than that code runs. With less of it the weights are the same to the last bit, and the
     voltages of a grid to 1e-7.
     """
