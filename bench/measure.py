@@ -36,7 +36,7 @@ UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
 
 
 class Effort(NamedTuple):
-    """How long to measure: turns of each program, seconds of a turn, seconds to wait for other work before each."""
+    """How long to measure: turns of each program, seconds of a turn, seconds to wait for other work before all of them."""
 
     turns: int
     seconds: float
@@ -44,7 +44,7 @@ class Effort(NamedTuple):
 
 
 # A lent GPU's host is never quiet, and other work on its cores hardly reaches the GPU: no turn waits for a pause there.
-FULL, ON_GPU, QUICK = Effort(5, 1.0, 20.0), Effort(5, 1.0, 0.0), Effort(2, 0.3, 0.0)
+FULL, ON_GPU, QUICK = Effort(5, 1.0, 60.0), Effort(5, 1.0, 0.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 
 
@@ -53,7 +53,7 @@ def rows(cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> I
     found, failed = {}, Failures()
     cases = [case for case in cases if _can_run(case, say)]
     for case in [case for case in cases if case.kind in ONCE]:
-        await_quiet(6 * effort.patience if case.kind == "start" else 0)
+        await_quiet(effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
     timed = [case for case in cases if case.kind not in ONCE]
@@ -198,9 +198,12 @@ class Turn(NamedTuple):
 def _take_turns(programs: dict[Case, Program], effort: Effort) -> dict[Case, list[Turn]]:
     """The turns of each program."""
     turns: dict[Case, list[Turn]] = {case: [] for case in programs}
+    patience = effort.patience
     for _ in range(effort.turns):
         for case, program in programs.items():
-            await_quiet(effort.patience)
+            begin = time.monotonic()
+            await_quiet(patience)
+            patience -= time.monotonic() - begin
             turns[case].append(_turn(program, effort.seconds))
     return turns
 
