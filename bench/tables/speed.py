@@ -183,8 +183,8 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "program": _shown("{}", "name"),
     "physics": _shown("{}", "physics"),
     "environments x steps": _sizes("num_envs", "rollout_length"),
-    "networks; cost": _shown("{}", "networks"),
     "of pmt train, MAPPO-L": _shown("{:.2f}", _of_mappo_l),
+    "other work, CPUs": _shown("{:.1f}", "other_work_cpus"),
     "turns' reward": _turns("rewards"),
     "turns' cost": _turns("costs"),
     "": _contestant,
@@ -476,9 +476,9 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "peers",
         ("peer",),
         (
-            *("program", "task", "physics", "environments x steps", "networks; cost"),
-            *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost"),
-            "first update, s",
+            *("program", "task", "physics", "environment steps/s", "of pmt train, MAPPO-L"),
+            *("turns' reward", "turns' cost"),
+            *("first update, s", "other work, CPUs"),
         ),
     ),
 }
