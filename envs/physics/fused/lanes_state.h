@@ -14,6 +14,7 @@ constexpr bool reads(int field) {
   }
   return false;
 }
+constexpr int NSEGMENT_PAIRS = NPAIRS - NBLOCK_PAIRS;  // those of two segments are the first
 constexpr bool FLUID = NBOXES > 0;
 constexpr bool READS_FORCES = reads(CFRC_EXT);
 
