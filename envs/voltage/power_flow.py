@@ -522,10 +522,7 @@ def branch_network(
     _check_connected(n_bus, f, t, slack, name)
     where = np.setdiff1d(np.arange(n_bus), [slack]) if inject is None else _injection_buses(inject, n_bus, slack)
     slack_v = slack_vm * np.exp(1j * slack_va)
-    try:
-        z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v)
-    except np.linalg.LinAlgError:
-        raise TaskError(f"network '{name}': its admittances cancel, so voltages do not follow from currents") from None
+    z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v, name)
     series = to_series @ z_all[:, where]
     series_0 = to_series @ v_0
     feed, feed_0 = y_bus[slack] @ z_all[:, where], y_bus[slack] @ v_0
@@ -555,11 +552,14 @@ def branch_network(
     )
 
 
-def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex) -> tuple[np.ndarray, np.ndarray]:
+def _solved_for_voltage(y_bus: np.ndarray, slack: int, slack_v: complex, name: str) -> tuple[np.ndarray, np.ndarray]:
     """z [n, n] and v_0 [n], p.u., with V = z I + v_0; the slack's row and column of z are 0: no current moves it."""
     others = np.setdiff1d(np.arange(len(y_bus)), [slack])
     z_all = np.zeros(y_bus.shape, complex)
-    z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
+    try:
+        z_all[np.ix_(others, others)] = np.linalg.inv(y_bus[np.ix_(others, others)])
+    except np.linalg.LinAlgError:
+        raise TaskError(f"network '{name}': its admittances cancel, so voltages do not follow from currents") from None
     v_0 = -z_all @ y_bus[:, slack] * slack_v
     v_0[slack] = slack_v
     return z_all, v_0
