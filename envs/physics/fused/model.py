@@ -1,8 +1,8 @@
 """Tables of a compiled MjModel that the fused step is generated from, and what it cannot step.
 
 The step knows a tree of slides and hinges on the world or on one free root; spheres and capsules that touch horizontal
-planes, boxes and one another; pyramidal cones, limits, springs, damping, fluid by inertia boxes; Euler and RK4. Nothing here
-depends on the robot.
+planes, boxes and one another; pyramidal cones, limits, springs, damping, fluid by inertia boxes; Euler and RK4.
+Nothing here depends on the robot.
 
 Bodies without joints are lumped into the moving body they are welded to. Moving body 0 is the base: the free root, or
 the world. All places and axes below are in the frame of a moving body.
