@@ -19,7 +19,7 @@ import scipy.stats
 
 import envs
 from envs import physics
-from envs.ant import corridor
+from envs.ant import corridor, walls
 from envs.physics import warp_engine
 from envs.physics.fused import gpu, threads
 from envs.physics.fused.model import tables
@@ -213,10 +213,13 @@ READOUT = {name: (name, slice(None)) for name in ("xpos", "xquat", "cinert", "cv
 @functools.cache
 def robot(name: str) -> tuple:
     """Tables of a robot and 200 states [n, D] that random controls lead to: qpos, qvel, warm start, ctrl."""
-    model = corridor.model() if name == "corridor" else robots.model(name)
-    made_of = tables(model, corridor.SUBSTEPS if name == "corridor" else robots.ROBOTS[name].substeps, READOUT)
+    ant = {"corridor": corridor.model(), "walls": walls.model("solid")}.get(name)
+    model = ant or robots.model(name)
+    made_of = tables(model, corridor.SUBSTEPS if ant else robots.ROBOTS[name].substeps, READOUT)
     rng, count = np.random.default_rng(0), 200
     qpos = model.qpos0 + rng.uniform(-0.1, 0.1, (count, model.nq))
+    if name == "walls":
+        qpos[:, 1] += rng.choice([-4.3, 4.3], count)
     if made_of.has_free:
         qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     speed, still = 0.1 * rng.normal(size=(count, model.nv)), np.zeros((count, model.nv))
@@ -227,7 +230,7 @@ def robot(name: str) -> tuple:
     return made_of, (*states, jnp.asarray(ctrl[30], jnp.float32))
 
 
-every_robot = pytest.mark.parametrize("name", ["corridor", *robots.ROBOTS])
+every_robot = pytest.mark.parametrize("name", ["corridor", "walls", *robots.ROBOTS])
 
 
 def same(a, b) -> bool:

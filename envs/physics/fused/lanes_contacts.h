@@ -2,15 +2,15 @@
 #pragma once
 #include "lanes_state.h"
 
-// Keeps a world's contacts within its room, and reports where it had too little.
-FUNCTION Mask admitted(Worlds& w, Mask has) {
-  if constexpr (MOST_CONTACTS < CANDIDATES) {
-    w.contacts += select(has, Num(1), Num(0));
-    const Mask over = has & (w.contacts > Num(MOST_CONTACTS));
-    w.overflow = select(over, Num(1), w.overflow);
-    return has & !over;
-  }
-  return has;
+// Keeps a world's contacts within its room, and reports where it had too little. Whether any world has the contact.
+FUNCTION bool admit(Worlds& w, Mask& has) {
+  if (!any(has)) return false;
+  if constexpr (MOST_CONTACTS >= CANDIDATES) return true;
+  w.contacts += select(has, Num(1), Num(0));
+  const Mask over = has & (w.contacts > Num(MOST_CONTACTS));
+  w.overflow = select(over, Num(1), w.overflow);
+  has &= !over;
+  return any(has);
 }
 
 FUNCTION Vec3 of_body(const Worlds& w, int b, const Real* place) {
@@ -69,8 +69,7 @@ FUNCTION void floor_contacts(Worlds& w) {
     const Num radius = Num(point.radius);
     const Num distance = dot(up, centre) + w.height - Num(point.height) - radius;
     Mask has = distance <= Num(point.contact.margin);
-    if (!any(has)) continue;
-    has = admitted(w, has);
+    if (!admit(w, has)) continue;
     const Vec3 first = point.capsule ? tangent(w.world, up, turned_with_body(w, b, point.axis)) : w.world.y;
     const Vec3 place = centre - up * (radius + Num(Real(.5)) * distance);
     const Frame frame = frame_of(place, up, first, point.contact.friction);
@@ -106,8 +105,7 @@ FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num s
   const Num length = root(dot(apart, apart));
   Num distance = length - Num(one.radius + two.radius);
   Mask has = wanted & (distance <= Num(pair.contact.margin));
-  if (!any(has)) return;
-  has = admitted(w, has);
+  if (!admit(w, has)) return;
   // A world without this contact must not see NaN: 0 * NaN would stay.
   distance = select(has, distance, Num(0));
   const Vec3 side1 = turned_with_body(w, one.body, one.side), side2 = turned_with_body(w, two.body, two.side);
@@ -163,8 +161,7 @@ FUNCTION void block_contact(Worlds& w, int c, const BlockRow& block, const Block
   Num out[3];
   Num distance = sphere_on_box(centre, Num(segment.radius), block.size, out);
   Mask has = wanted & (distance <= Num(pair.contact.margin));
-  if (!any(has)) return;
-  has = admitted(w, has);
+  if (!admit(w, has)) return;
   distance = select(has, distance, Num(0));
   const Vec3 normal = select(has, transposed_times(in.axes, vec(out[0], out[1], out[2])), w.world.x);
   const Vec3 surface = normal * (Num(segment.radius) + Num(Real(.5)) * distance);

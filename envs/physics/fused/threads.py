@@ -18,6 +18,7 @@ from .model import FIELDS, Contact, Impedance, Tables
 
 LANES = 32
 MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
+MOST_SEGMENTS, MOST_PAIRS = 512, 4096  # what a multiprocessor's memory has room for in each of its worlds
 
 _LONGEST_TRUNK = 9  # its triangle is in every lane's registers
 _ROUND_COST = 60.0  # of a round of the branches, in a trunk's multiplications
@@ -40,14 +41,18 @@ class Schedule(NamedTuple):
 def obstacle(tables: Tables) -> str | None:
     """Why a warp cannot step a world of the model, as the rest of a sentence; None if it can."""
     sizes = {
-        "degrees of freedom": tables.nv,
-        "joints": len(tables.joints),
-        "moving bodies": len(tables.bodies),
-        "joints with limits": len(tables.limits),
-        "bodies in a fluid": len(tables.boxes),
+        "degrees of freedom": (tables.nv, LANES),
+        "joints": (len(tables.joints), LANES),
+        "moving bodies": (len(tables.bodies), LANES),
+        "joints with limits": (len(tables.limits), LANES),
+        "bodies in a fluid": (len(tables.boxes), LANES),
+        "spheres and capsules that may touch others": (len(tables.segments), MOST_SEGMENTS),
+        "pairs of geoms that may touch": (len(tables.pairs), MOST_PAIRS),
     }
-    wrong = [f"{size} {what}" for what, size in sizes.items() if size > LANES]
-    return f"cannot step this model: it has {wrong[0]}, and a warp takes {LANES}" if wrong else None
+    for what, (size, most) in sizes.items():
+        if size > most:
+            return f"cannot step this model: it has {size} {what}, and a warp takes {most}"
+    return None
 
 
 def schedule(tables: Tables) -> Schedule:
@@ -385,7 +390,7 @@ def _contacts(out: _Writer, t: Tables) -> None:
         out.vectors("block_offset", (b.offset for b in t.blocks))
         out.vectors("block_size", (b.size for b in t.blocks))
         out.scalars("block_body", (b.body for b in t.blocks), "int")
-    out.scalars("pair_segments", (p.first | p.second << 8 for p in t.pairs), "unsigned")
+    out.scalars("pair_segments", (p.first | p.second << 16 for p in t.pairs), "unsigned")
     out.scalars("pair_far", (1.0001 * t.reach(p) ** 2 for p in t.pairs))
     contacts: list[Contact] = [p.contact for p in (*t.points, *t.pairs)]
     related = [{d, *t.ancestors[d]} for d in range(t.nv)]

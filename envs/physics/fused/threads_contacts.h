@@ -155,15 +155,15 @@ DEVICE bool has_block(int pair) { return BLOCK_PAIRS > 0 && (BLOCK_PAIRS == PAIR
 // Whether two bounding spheres touch, or one and a block.
 DEVICE bool is_near(const World& w, int pair) {
   const unsigned parts = pair_segments(pair);
-  const Vec middle = vec_at(w.segment[parts >> 8]);
+  const Vec middle = vec_at(w.segment[parts >> 16]);
   if (!has_block(pair)) {
-    const Vec between = vec_at(w.segment[parts & 255]) - middle;
+    const Vec between = vec_at(w.segment[parts & 65535]) - middle;
     return dot(between, between) <= pair_far(pair);
   }
-  const BlockFrame in = frame_of(w, parts & 255);
+  const BlockFrame in = frame_of(w, parts & 65535);
   real place[3], size[3];
   put(place, mul(in.axes, middle) + in.shift);
-  put(size, block_size(parts & 255));
+  put(size, block_size(parts & 65535));
   return square_outside(place, size) <= pair_far(pair);
 }
 
@@ -186,7 +186,7 @@ DEVICE int list_near(World& w) {
 // mjraw_SphereSphere at the nearest places. Segments that cross have no normal: MuJoCo takes a product of two axes.
 DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
   const unsigned segments = pair_segments(pair);
-  const int first = segments & 255, second = segments >> 8;
+  const int first = segments & 65535, second = segments >> 16;
   const real radii = segment_radius(first) + segment_radius(second), reach = radii + contact_margin(POINTS + pair);
   const Nearest found = nearest_of(vec_at(w.segment[first]), vec_at(w.segment[first] + 3), vec_at(w.segment[second]),
                                    vec_at(w.segment[second] + 3), reach, which);
@@ -211,11 +211,11 @@ DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
 // A block and a segment: a contact of each of the segment's spheres.
 DEVICE bool touches_block(const World& w, int pair, int which, Touch& touch) {
   const unsigned parts = pair_segments(pair);
-  const int segment = parts >> 8;
-  const BlockFrame in = frame_of(w, parts & 255);
+  const int segment = parts >> 16;
+  const BlockFrame in = frame_of(w, parts & 65535);
   const Vec middle = vec_at(w.segment[segment]), half = vec_at(w.segment[segment] + 3);
   real size[3], out[3], centre[3], axis[3];
-  put(size, block_size(parts & 255));
+  put(size, block_size(parts & 65535));
   put(centre, mul(in.axes, middle) + in.shift);
   put(axis, mul(in.axes, half));
   real share = 0;

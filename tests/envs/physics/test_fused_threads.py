@@ -235,6 +235,14 @@ def test_more_bodies_than_lanes_are_refused():
     assert reason is not None and "33 moving bodies" in reason and "32" in reason
 
 
+def test_more_pairs_than_a_world_lists_are_refused():
+    balls = "".join(f"<body pos='{k} 0 0'><joint/><geom size='.1'/></body>" for k in range(16))
+    boxes = "".join(f"<geom type='box' size='.1 .1 .1' pos='{k} 9 0'/>" for k in range(260))
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{balls}{boxes}</worldbody></mujoco>")
+    reason = threads.obstacle(tables(model, 1, {}))
+    assert reason is not None and f"{16 * 15 // 2 + 16 * 260} pairs of geoms" in reason and "4096" in reason
+
+
 # -- PTX --
 
 nvidia = pytest.mark.skipif(nvrtc.obstacle() is not None, reason="no NVRTC here")
