@@ -36,7 +36,7 @@ Step = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], list[jax.Array]]
 HERE = pathlib.Path(__file__).parent
 INSTALL = "install g++ or clang++, or pip install 'pmt-jax[native]'"
 _SOURCES = ("lanes.cpp", *sorted(path.name for path in HERE.glob("lanes*.h")))
-_SOURCES += ("algebra.h", "formulae.h", "rows.h", "vector.h")
+_SOURCES += ("algebra.h", "boxes.h", "formulae.h", "rows.h", "vector.h")
 _FLAGS = "-O3 -std=c++17 -shared -fPIC -fno-math-errno -fno-trapping-math -ffp-contract=fast".split()
 _PATIENCE = 600.0  # seconds for a compiler; one on a loaded machine took 20
 

@@ -18,6 +18,7 @@ import envs
 from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
+from envs.hands import hand_over
 from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
 from paths import ROOT
@@ -390,9 +391,11 @@ def test_on_a_gpu_warp_takes_what_fused_cannot_step(monkeypatch):
     monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
     monkeypatch.setattr(contract, "installed_version", lambda _: "1.18")
     assert physics.resolve("auto", walls.model()) == "fused"
-    assert physics.resolve("auto", walls.model("solid")) == "warp"
+    assert physics.resolve("auto", walls.model("solid")) == "fused"
+    hands = hand_over.model()
+    assert physics.resolve("auto", hands) == "warp"
     with pytest.raises(TaskError, match=r"cannot step this model: .* \(take 'warp'\)"):
-        physics.resolve("fused", walls.model("solid"))
+        physics.resolve("fused", hands)
 
 
 def test_room_for_contacts_in_warp():
