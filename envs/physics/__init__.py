@@ -68,6 +68,7 @@ def make_engine(
     *,
     substeps: int,
     readout: Readout,
+    forward: bool = False,
     physics: str = "auto",
     solver: str = "converged",
     fast_contacts: Collection[str] = (),
@@ -78,8 +79,10 @@ def make_engine(
 
     Args:
       model: a compiled model; it is copied, never changed.
-      substeps: integration steps in a control step.
+      substeps: integration steps in a control step; 0 leaves the state as it is.
       readout: derived arrays to return, e.g. `{"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}`.
+      forward: a step ends with a forward pass at the new state, under the same controls: readouts and the warm start are
+        of that state, not of the last substep.
       physics: `auto` or one of `ENGINES`; `auto` takes the fastest for the device (`engine.name` says which).
       solver: `converged` keeps the model's solver settings; `fast` cuts Newton to 4 iterations of 8 line-search steps
         and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors
@@ -92,7 +95,7 @@ def make_engine(
       TaskError: unknown engine or solver, or an engine that cannot run here, or not with this model.
     """
     one_of("solver", solver, SOLVERS)
-    chosen = resolve(physics, model, readout)
+    chosen = resolve(physics, model, readout, forward)
     if model.na or model.nmocap:
         raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
     model = copy.copy(model)
@@ -108,18 +111,18 @@ def make_engine(
         except NoLibrary as error:
             if physics != "auto":
                 raise TaskError(f"physics 'fused' {error}") from error
-            chosen = resolve("auto", model, readout)
+            chosen = resolve("auto", model, readout, forward)
     if chosen == "mujoco":
         from .c_engine import CEngine
 
-        return CEngine(model, substeps, readout, threads)
+        return CEngine(model, substeps, readout, threads, forward)
     if chosen == "warp":
         from .warp_engine import WarpEngine
 
-        return WarpEngine(model, substeps, readout, contacts)
+        return WarpEngine(model, substeps, readout, contacts, forward)
     from .mjx_engine import MjxEngine
 
-    return MjxEngine(model, substeps, readout)
+    return MjxEngine(model, substeps, readout, forward)
 
 
 def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
