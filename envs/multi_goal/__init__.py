@@ -30,7 +30,7 @@ LEVELS = (
 VARIANTS = {f"{robot}_{level}": (robot, level) for robot in ("point", "ant") for level in range(len(LEVELS))}
 
 COLUMNS = {
-    "reached": Column("reached", "goals that an agent reaches per step, mean over agents; 0.01 is 10 in 1000 steps", 0, 1),
+    "reached": Column("reached", "goals reached per agent and step; 0.01 is 10 in an episode of 1000 steps", 0, 1),
     "hazards": Column("hazards", "share of steps in which an agent is in a hazard, mean over agents", 0, 1),
     "vases": Column("vases", "share of steps in which an agent touches a vase or one of its vases moves", 0, 1),
     "robots": Column("robots", "share of steps in which robots touch, as the cost counts it", 0, 1),

@@ -17,8 +17,8 @@ _BALL, _ARROW, _TORSO, _LEG = 0.1, 0.05, 0.0625, 0.02  # m: radii, and half the 
 def groups_of(robot: str, qpos: jax.Array, whole: bool) -> Group:
     """Each agent's group, with a leading [N], from the robots' qpos [N, nq].
 
-    `whole` or of points: all geoms of the agent's own robot. Else as the reference cuts the ants' geoms: agent 0 has the
-    torso and the first part of leg 1 of ant 0, agent 1 the rest of that leg.
+    `whole` or of points: all geoms of the agent's own robot. Else as the reference cuts the ants' geoms: agent 0 has
+    the torso and the first part of leg 1 of ant 0, agent 1 the rest of that leg.
     """
     if robot == "point":
         return jax.vmap(_point)(qpos)

@@ -49,7 +49,7 @@ ROBOTS = {
         nq=3,
         nv=3,
         motors=("thrust", "turn"),
-        on_floor=False,  # its ball touches the floor at a distance of exactly 0, which MuJoCo drops; deeper, it would stick
+        on_floor=False,  # the ball touches it at a distance of exactly 0, which MuJoCo drops; 1e-7 deeper, it sticks
         site=0.0,
         least_height=None,
     ),
@@ -108,4 +108,3 @@ def _add_vase(arena: mujoco.MjSpec, number: int) -> None:
         conaffinity=_FLOOR | _VASE,
         rgba=[0.2, 0.75, 0.8, 1.0],
     )
-

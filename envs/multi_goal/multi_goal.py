@@ -218,9 +218,7 @@ class MultiGoal:
         start = self._at_rest.start()
         dtype, agents, vases = start.qpos.dtype, self.num_agents, self._vases.count
         places, crowded = layout(layout_key, self._plan, self.size, dtype)
-        robots, goals, hazards, vase_places = jnp.split(
-            places, np.cumsum([agents, agents, self.num_hazards]).tolist()
-        )
+        robots, goals, hazards, vase_places = jnp.split(places, np.cumsum([agents, agents, self.num_hazards]).tolist())
         headings = jax.random.uniform(heading_key, (agents + vases,), dtype, 0.0, 2 * jnp.pi)
         if self.robot == "point":
             qpos = jnp.concatenate([robots, headings[:agents, None]], axis=1)
@@ -294,7 +292,7 @@ class MultiGoal:
             key = jax.random.wrap_key_data(key)
         physics = PhysicsState(self._with_unit_quaternions(qpos), qvel, warmstart)
         zero = jnp.zeros((), dtype)
-        return self._initial_state(Carry(physics, jnp.asarray(goals, dtype), hazards, owner, key, zero), warmstart)
+        return self._initial_state(Carry(physics, jnp.asarray(goals, dtype), hazards, owner, key, zero))
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -318,8 +316,7 @@ class MultiGoal:
     def _drawn(self, state: State) -> dict[str, Any]:
         carry: Carry = state.carry
         costs = [jnp.stack([state.info[f"cost_{kind}_{i}"] for kind in KINDS]).max() for i in range(self.num_agents)]
-        bodies, robots = self._bodies(carry.physics)
-        del robots
+        bodies, _ = self._bodies(carry.physics)
         return {
             "qpos": carry.physics.qpos,
             "goals": carry.goals,
@@ -330,12 +327,9 @@ class MultiGoal:
             "hazard_lidar": self._lidar(bodies, carry.hazards),
         }
 
-    def _initial_state(self, carry: Carry, warmstart: jax.Array | None = None) -> State:
-        """A State that no transition led to; its physics keeps `warmstart` if that is given."""
-        physics, out, left_out = self._advance(self._at_rest, carry.physics, jnp.zeros(self.model.nu))
-        del left_out
-        kept = carry.physics if warmstart is not None else physics
-        carry = dataclasses.replace(carry, physics=dataclasses.replace(carry.physics, warmstart=kept.warmstart))
+    def _initial_state(self, carry: Carry) -> State:
+        """A State that no transition led to."""
+        _, out, _ = self._advance(self._at_rest, carry.physics, jnp.zeros(self.model.nu))
         obs, global_state = self._get_obs(carry, out["qacc"])
         nothing = jnp.zeros(self.num_agents, carry.goals.dtype)
         info = self._get_info(nothing, nothing, dict.fromkeys(KINDS, nothing))
@@ -386,10 +380,11 @@ class MultiGoal:
         agents = self.num_agents
         bodies, robots = self._bodies(carry.physics)
         sense = functools.partial(sensors, self.robot, self._kind.site)
-        parts = [jax.vmap(sense)(robots, *(x[: self._vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc)))]
+        qvel, qacc = (x[: self._vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
+        parts = [jax.vmap(sense)(robots, qvel, qacc)]
         if self.own:
-            nearest = lambda body, goal: lidar(goal[None], body, self._bins, self._range)  # noqa: E731
-            parts += [jax.vmap(nearest)(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
+            own_goals = jnp.stack([self._lidar(bodies, goal[None])[i] for i, goal in enumerate(carry.goals)])
+            parts += [own_goals, self._lidar_of_others(bodies, carry.goals)]
         else:
             parts += [self._lidar(bodies, goal[None]) for goal in carry.goals]
         if self.level:

@@ -79,10 +79,10 @@ def make_engine(
 
     Args:
       model: a compiled model; it is copied, never changed.
-      substeps: integration steps in a control step; 0 leaves the state as it is.
+      substeps: integration steps in a control step; 0, with `forward`, leaves the state as it is.
       readout: derived arrays to return, e.g. `{"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}`.
-      forward: a step ends with a forward pass at the new state, under the same controls: readouts and the warm start are
-        of that state, not of the last substep.
+      forward: a step ends with a forward pass at the new state under the same controls, and readouts are of that state,
+        not of the last substep.
       physics: `auto` or one of `ENGINES`; `auto` takes the fastest for the device (`engine.name` says which).
       solver: `converged` keeps the model's solver settings; `fast` cuts Newton to 4 iterations of 8 line-search steps
         and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors

@@ -35,7 +35,9 @@ class CEngine:
 
     name = "mujoco"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None, forward: bool = False):
+    def __init__(
+        self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None, forward: bool = False
+    ):
         threads = usable_cpus() if threads is None else int(at_least("threads", threads, 1))
         _prepare_process()
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.

@@ -76,9 +76,9 @@ class Engine(Protocol):
 
         Returns:
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
-          stage, not to the new qpos, unless the engine was made with `forward`. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. The
-          readout `overflow` is 1 if the step found no room for all contacts or constraints and is wrong, else 0: only
-          fused and warp have buffers that can be too small without raising.
+          stage, not to the new qpos, unless the engine was made with `forward`. Contact forces (`cfrc_ext`) include
+          `mj_rnePostConstraint`. The readout `overflow` is 1 if the step found no room for all contacts or constraints
+          and is wrong, else 0: only fused and warp have buffers that can be too small without raising.
         """
         ...
 

@@ -55,9 +55,7 @@ class _Simulations:
         self._inputs = [*state, batch.bind("ctrl")]
         self._outputs = [*state, *(batch.bind(field)[:, index] for field, index in readout.values())]
 
-    def advance(
-        self, rows: np.ndarray, todo: np.ndarray, out: np.ndarray, substeps: int, stage: int
-    ) -> None:
+    def advance(self, rows: np.ndarray, todo: np.ndarray, out: np.ndarray, substeps: int, stage: int) -> None:
         batch = self._batch
         batch.time[:] = 0.0
         batch.warning[..., 1] = 1  # C reports the first of each kind only
