@@ -1,0 +1,377 @@
+"""The MultiGoal tasks against transitions recorded from Safety-Gymnasium, and against their own rules."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs.errors import TaskError
+from envs.multi_goal import LEVELS, VARIANTS, models
+from envs.multi_goal.multi_goal import KINDS
+from envs.multi_goal.sensing import SENSORS
+from places import DATA
+
+NAMES = [f"multi_goal_{variant}" for variant in VARIANTS]
+DEFAULT = ("multi_goal_point_2", "multi_goal_ant_1")  # both robots, hazards, vases with and without a cost, slots
+# Against MuJoCo 3.17 and against the reference's 2.3.3: largest error of robots' and vases' qpos and qvel, of rewards,
+# and of observations over 1 + |x|.
+NEW, OLD = (2e-5, 5e-4, 2e-5, 5e-4, 1e-4, 1e-3), (2e-5, 5e-4, 1e-4, 1e-2, 1e-4, 2e-3)
+MJX = (5e-5, 5e-3, 1e-4, 1e-2, 2e-4, 5e-2)
+
+
+def each(default: tuple[str, ...] = DEFAULT):
+    marked = [pytest.param(name, marks=() if name in default else pytest.mark.full) for name in NAMES]
+    return pytest.mark.parametrize("name", marked)
+
+
+@functools.cache
+def recordings() -> dict[str, np.ndarray]:
+    with np.load(DATA / "multi_goal_reference.npz") as data:
+        return dict(data)
+
+
+def recording(name: str) -> dict[str, np.ndarray]:
+    return {k.split("/")[1]: x for k, x in recordings().items() if k.startswith(f"{name}/")}
+
+
+@functools.cache
+def made(name: str, physics: str = "mujoco", **options: Any):
+    env: Any = envs.make(name, physics=physics, observation="raw", **options)
+    level = env.level > 0
+
+    def restore(qpos, qvel, warmstart, goals, hazards, owner):
+        return env.restore(qpos, qvel, goals, warmstart, hazards if level else None, owner)
+
+    return env, jax.jit(jax.vmap(restore)), jax.jit(jax.vmap(env.step)), jax.jit(jax.vmap(env.reset))
+
+
+def replayed(name: str, physics: str = "mujoco", **options: Any):
+    rows, (_, restore, step, _) = recording(name), made(name, physics, **options)
+    before = restore(*(rows[f"{key}0"] for key in ("qpos", "qvel", "warm", "goals", "hazards", "owner")))
+    return rows, step(before, rows["action"])
+
+
+def columns(state, name: str) -> np.ndarray:
+    """[rows, 2] of an entry of `info` that each agent has."""
+    return np.stack([state.info[f"{name}_{i}"] for i in range(2)], axis=1)
+
+
+def observation_error(env, rows, state, expected) -> np.ndarray:
+    """[rows], without the lidars of goals that were reached: where the new ones are is random."""
+    error = np.abs(np.asarray(state.global_state, float) - expected) / (1 + np.abs(expected))
+    error = error.reshape(len(error), 2, -1)
+    first = sum(block.size for block in SENSORS[env.robot])
+    for goal in range(2):
+        error[:, :, first + 16 * goal : first + 16 * (goal + 1)] *= ~rows["reached"][:, goal, None, None]
+    return error.max((1, 2))
+
+
+def check_replay(name: str, tolerance, suffix: str, chosen, physics: str = "mujoco", share: float = 0.0, **options):
+    rows, after = replayed(name, physics, **options)
+    env, *_ = made(name, physics, **options)
+    chosen = chosen(rows)
+    robots = env.num_agents * models.ROBOTS[env.robot].nq, env.num_agents * models.ROBOTS[env.robot].nv
+    errors = {}
+    for what, entries, (most, most_of_vases) in (
+        ("qpos", robots[0], tolerance[0:4:2]),
+        ("qvel", robots[1], tolerance[1:4:2]),
+    ):
+        error = np.abs(np.asarray(getattr(after.carry.physics, what), float) - rows[f"{what}1{suffix}"])
+        errors[what] = error[:, :entries].max(1) / most
+        errors[f"{what} of vases"] = error[:, entries:].max(1, initial=0.0) / most_of_vases
+    errors["reward"] = np.abs(columns(after, "reward") - rows[f"reward{suffix}"]).max(1) / tolerance[4]
+    errors["observation"] = observation_error(env, rows, after, rows[f"obs1{suffix}"]) / tolerance[5]
+    for what, error in errors.items():
+        assert (error[chosen] > 1).mean() <= share, (what, error[chosen].max())
+    kinds = np.stack([columns(after, f"cost_{kind}") for kind in KINDS], axis=2)
+    np.testing.assert_array_equal(kinds[chosen], rows[f"kinds{suffix}"][chosen])
+    np.testing.assert_array_equal(after.cost[chosen, :, 0], kinds[chosen].max(2))
+    np.testing.assert_array_equal(columns(after, "reached")[chosen], rows["reached"][chosen])
+    np.testing.assert_array_equal(after.terminated[chosen], rows["terminated"][chosen])
+    np.testing.assert_array_equal(after.carry.goals[~rows["reached"]], rows["goals1"][~rows["reached"]])
+    if "vases" in env.charges:
+        np.testing.assert_array_equal(after.carry.vase_owner[chosen], rows["owner1"][chosen])
+    np.testing.assert_allclose(after.reward, columns(after, "reward").mean(1), rtol=1e-6, atol=1e-7)
+
+
+@each()
+def test_reproduces_the_recorded_steps_of_its_own_version(name):
+    check_replay(name, NEW, "_317", lambda rows: np.ones(len(rows["qpos0"]), bool))
+
+
+@each()
+def test_reproduces_the_recorded_steps_of_the_reference(name):
+    check_replay(name, OLD, "", lambda rows: rows["exact"])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("slots", [2, 10])
+def test_the_number_of_vase_slots_does_not_show(slots):
+    check_replay("multi_goal_point_2", NEW, "_317", lambda rows: np.ones(len(rows["qpos0"]), bool), vase_slots=slots)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["multi_goal_point_0", "multi_goal_point_1"])
+def test_reproduces_the_recorded_steps_on_mjx(name):
+    check_replay(name, MJX, "", lambda rows: rows["exact"] & ~rows["boxes"], physics="mjx", share=0.03)
+
+
+@each(default=DEFAULT[:1])
+def test_reproduces_the_recorded_resets(name):
+    rows, (env, restore, _, _) = recording(name), made(name)
+    still = np.zeros((len(rows["reset_qpos"]), env._vases.nv + 6 * env._vases.count), np.float32)
+    owner = np.zeros((len(still), env._vases.count), int)
+    state = restore(rows["reset_qpos"], still, still, rows["reset_goals"], rows["reset_hazards"], owner)
+    np.testing.assert_allclose(state.global_state, rows["reset_obs"], atol=2e-4, rtol=2e-5)
+
+
+@pytest.mark.parametrize("robot", models.ROBOTS)
+def test_models_compile_to_the_recorded_arrays(robot):
+    model, seen = models.model(robot, 2, 1, LEVELS[1].size), 0
+    for key, expected in recordings().items():
+        if not key.startswith(f"model/{robot}/"):
+            continue
+        field = key.rpartition("/")[2]
+        actual = np.asarray(model.stat.meaninertia if field == "meaninertia" else getattr(model, field))
+        if robot == "point" and field.startswith("actuator"):
+            actual = actual[[0, 2, 1, 3]]  # the reference has both thrusts first
+        # The reference ends with bodies of goals and hazards, which are arithmetic here; its floor has another size.
+        expected = expected[: len(actual)] if expected.ndim else expected
+        skip = int(field == "geom_size")
+        np.testing.assert_allclose(actual[skip:], expected[skip:], rtol=1e-7, atol=1e-12, err_msg=field) if (
+            expected.ndim
+        ) else np.testing.assert_allclose(actual, expected, rtol=1e-9)
+        seen += 1
+    assert seen > 10
+
+
+def test_agents_of_the_reference_share_the_points_motors_and_own_ones_do_not():
+    state = {}
+    for wiring in ("reference", "own"):
+        env: Any = envs.make("multi_goal_point_0", physics="mujoco", wiring=wiring)
+        start = env.restore(np.array([-0.5, 0, 0, 0.5, 0, 0]), np.zeros(6), np.full((2, 2), 0.9))
+        state[wiring] = np.asarray(env.step(start, np.array([[1.0, -1.0], [0.0, 0.0]])).carry.physics.qvel)
+    forward, turn = state["reference"][[0, 3]], state["own"]
+    assert forward[0] > 0 > forward[1] and abs(state["reference"][[2, 5]]).max() < 1e-6  # agent 0 drives both
+    assert turn[0] > 0 > turn[2] and abs(turn[3:]).max() < 1e-6  # agent 0 drives and turns its own
+
+
+def standing(env, **places: Any):
+    """The points of `env` at rest in a corner of an empty world, but for what `places` says, after a step of rest."""
+    count, vases = env.num_hazards, env._vases.count
+    qpos = np.concatenate(
+        [[-1.6, -1.6, 0, 1.6, -1.6, 0], *([0.3 * v - 1.5, 1.6, 0.1, 1, 0, 0, 0] for v in range(vases))]
+    )
+    for entry, x in places.get("qpos", {}).items():
+        qpos[entry] = x
+    qvel = np.zeros(6 + 6 * vases)
+    for entry, x in places.get("qvel", {}).items():
+        qvel[entry] = x
+    hazards = np.full((count, 2), 1.8)
+    hazards[0] = places.get("hazard", (1.8, 1.8))
+    owner = np.zeros(vases, int)
+    state = env.restore(qpos, qvel, np.array([[1.2, 1.2], [-1.2, 1.2]]), hazards=hazards, vase_owner=owner)
+    return env.step(state, np.zeros((2, 2)))
+
+
+@functools.cache
+def point_2(**options: Any):
+    env: Any = envs.make("multi_goal_point_2", physics="mujoco", **options)
+    env.step = jax.jit(env.step)
+    env.restore = jax.jit(env.restore)
+    return env
+
+
+def test_costs_are_the_agents_own():
+    env = point_2(cost="kinds")
+    assert env.spec.num_costs == 3 and env.spec.cost_limit == (25.0, 25.0, 25.0)
+    assert not envs.base.shares_cost(env)
+    in_hazard = standing(env, hazard=(-1.6, -1.5))
+    assert in_hazard.cost.tolist() == [[1, 0, 0], [0, 0, 0]]
+    touching = standing(env, qpos={3: -1.45, 4: -1.6})  # balls overlap
+    assert touching.cost.tolist() == [[0, 0, 1], [0, 0, 1]]
+    # Robot 1 stands in vase 0, which belongs to nobody in particular, that is to agent 0, and which it pushes away.
+    at_vase = standing(env, qpos={3: -1.5, 4: 1.46})
+    assert at_vase.cost[1].tolist() == [0, 1, 0] and int(at_vase.carry.vase_owner[0]) == 1
+    assert float(at_vase.info["cost_vases_velocity_1"]) == 1.0 and float(at_vase.info["cost_vases_contact_0"]) == 0.0
+    for state in (in_hazard, touching, at_vase):
+        kinds = {"hazards": 0, "vases": 1, "robots": 2}
+        np.testing.assert_allclose([state.info[k] for k in kinds], state.cost.mean(0))
+
+
+def test_a_reached_goal_moves_and_only_that():
+    env, _, step, reset = made("multi_goal_point_1")
+    state = reset(jax.random.split(jax.random.key(5), 64))
+    carry = state.carry
+    robots = carry.physics.qpos[:, :6].reshape(-1, 2, 3)[:, :, :2]
+    goals = carry.goals.at[:, 0].set(robots[:, 0] + 0.1)
+    before = jax.tree.map(lambda x: x, state)
+    before.carry.__dict__["goals"] = goals
+    after = step(before, jnp.zeros((64, 2, 2)))
+    assert columns(after, "reached").tolist() == [[1, 0]] * 64
+    moved, stayed = np.asarray(after.carry.goals[:, 0]), np.asarray(after.carry.goals[:, 1])
+    np.testing.assert_array_equal(stayed, goals[:, 1])
+    np.testing.assert_allclose(columns(after, "reward")[:, 0], 1.0, atol=2e-3)
+    distance = functools.partial(lambda a, b: np.linalg.norm(a - b, axis=-1))
+    assert distance(moved, stayed).min() >= 0.61 and distance(moved, np.asarray(goals[:, 0])).min() >= 0.61
+    assert distance(moved, np.asarray(robots[:, 0])).min() >= 0.705 - 1e-3
+    assert distance(moved[:, None], np.asarray(carry.hazards)).min() >= 0.485 - 1e-6
+    assert np.abs(moved).max() <= 1.5 - 0.305 and not np.asarray(after.info["misplaced"]).any()
+    assert len(np.unique(moved, axis=0)) == 64
+
+
+def test_what_mujoco_calls_a_contact_is_what_counts():
+    """Random points and vases: geoms overlap exactly where the engine lists contacts."""
+    env, model = point_2(), models.model("point", 2, 10, 2.0)
+    from envs.multi_goal.groups import groups_of, touched_robots, touched_vases
+
+    rng, data, found = np.random.default_rng(0), mujoco.MjData(model), 0
+    geoms = {model.geom(g).name: g for g in range(model.ngeom)}
+    touches = jax.jit(
+        lambda qpos: (
+            touched_vases(groups_of("point", qpos[:6].reshape(2, 3), True), qpos[6:].reshape(-1, 7)),
+            touched_robots(groups_of("point", qpos[:6].reshape(2, 3), True)),
+        )
+    )
+    for _ in range(60):
+        data.qpos[:6] = rng.uniform(-0.25, 0.25, 6) * [1, 1, 12, 1, 1, 12]
+        vases = np.column_stack([rng.uniform(-0.5, 0.5, (10, 2)), rng.uniform(0.05, 0.2, 10), rng.normal(size=(10, 4))])
+        vases[:, 3:] /= np.linalg.norm(vases[:, 3:], axis=1, keepdims=True)
+        data.qpos[6:] = vases.ravel()
+        mujoco.mj_fwdPosition(model, data)
+        pairs = {frozenset(map(int, contact.geom)) for contact in data.contact[: data.ncon]}
+        by_name = lambda a, b: frozenset((geoms[a], geoms[b])) in pairs  # noqa: E731
+        own = [[f"{i}/ball", f"{i}/arrow"] for i in range(2)]
+        expected = [[any(by_name(g, f"vase{v}") for g in own[i]) for v in range(10)] for i in range(2)]
+        robots = any(by_name(a, b) for a in own[0] for b in own[1])
+        vase_touches, robot_touches = touches(jnp.asarray(data.qpos, jnp.float32))
+        np.testing.assert_array_equal(vase_touches, expected)
+        assert robot_touches.tolist() == [robots] * 2
+        found += np.sum(expected) + robots
+    assert found > 100 and env.charges == ("hazards", "vases", "robots")
+
+
+@pytest.mark.full
+def test_what_mujoco_calls_a_contact_of_ants_is_what_counts():
+    from envs.multi_goal.groups import groups_of, touched_robots, touched_vases
+
+    model = models.model("ant", 2, 2, 2.0)
+    rng, data, found = np.random.default_rng(1), mujoco.MjData(model), 0
+    owner = {g: model.geom(g).name[0] for g in range(model.ngeom)}
+
+    @jax.jit
+    def touches(qpos):
+        groups = groups_of("ant", qpos[:30].reshape(2, 15), True)
+        return touched_vases(groups, qpos[30:].reshape(-1, 7)), touched_robots(groups)
+
+    for _ in range(200):
+        for i in range(2):
+            data.qpos[15 * i : 15 * i + 3] = rng.uniform(-0.2, 0.2, 3) + [0, 0, 1]
+            data.qpos[15 * i + 7 : 15 * i + 15] = rng.uniform(-1, 1, 8)
+            data.qpos[30 + 7 * i : 33 + 7 * i] = rng.uniform(-0.3, 0.3, 3) + [0, 0, 1]
+            for start in (15 * i + 3, 33 + 7 * i):
+                quat = rng.normal(size=4)
+                data.qpos[start : start + 4] = quat / np.linalg.norm(quat)
+        mujoco.mj_fwdPosition(model, data)
+        pairs = {frozenset(owner[int(g)] + str(int(g)) * (owner[int(g)] == "v") for g in c.geom) for c in data.contact}
+        vase = {v: f"v{model.geom(f'vase{v}').id}" for v in range(2)}
+        expected = [[frozenset((str(i), vase[v])) in pairs for v in range(2)] for i in range(2)]
+        vase_touches, robot_touches = touches(jnp.asarray(data.qpos, jnp.float32))
+        np.testing.assert_array_equal(vase_touches, expected)
+        assert robot_touches.tolist() == [frozenset("01") in pairs] * 2
+        found += np.sum(expected) + (frozenset("01") in pairs)
+    assert found > 100
+
+
+def test_ants_end_on_their_backs_and_points_never():
+    env: Any = envs.make("multi_goal_ant_0", physics="mujoco")
+    assert env._ends(env._at_rest.start()).tolist() is True  # all at z = 0
+    high = env._at_rest.start().qpos.at[jnp.array([2, 17])].set(0.081)
+    for low, ends in ((0.081, False), (0.08, True), (0.05, True)):
+        physics = envs.physics.PhysicsState(high.at[17].set(low), jnp.zeros(28), jnp.zeros(28))
+        assert bool(env._ends(physics)) is ends
+    assert not envs.make("multi_goal_point_0", physics="mujoco")._ends(None)
+
+
+def test_observations_are_standardised_over_their_own_entries():
+    raw, scored = (envs.make("multi_goal_point_1", physics="mujoco", observation=x) for x in ("raw", "zscore"))
+    a, b = (jax.jit(env.reset)(jax.random.key(1)) for env in (raw, scored))
+    np.testing.assert_array_equal(a.obs, np.c_[np.tile(a.global_state, (2, 1)), np.eye(2)])
+    x = np.asarray(a.obs, float)
+    np.testing.assert_allclose(b.obs, (x - x.mean(1, keepdims=True)) / x.std(1, keepdims=True), atol=1e-5)
+    np.testing.assert_allclose(b.global_state, (x[0, :-2] - x[0, :-2].mean()) / x[0, :-2].std(), atol=1e-5)
+
+
+@pytest.mark.parametrize("agents", [2, pytest.param(5, marks=pytest.mark.full)])
+def test_own_robots_see_each_other_and_pay_for_touching(agents):
+    env: Any = envs.make(
+        "multi_goal_point_1", physics="mujoco", wiring="own", num_agents=agents, observation="raw", hazards=3, vases=0
+    )
+    state = jax.jit(env.reset)(jax.random.key(2))
+    assert state.obs.shape == (agents, env.spec.obs_dim) == (agents, 12 + 5 * 16 + agents)
+    np.testing.assert_array_equal(state.global_state, np.asarray(state.obs[:, :-agents]).ravel())
+    places = np.asarray(state.carry.physics.qpos).reshape(-1, 3)
+    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2) + 9 * np.eye(agents)
+    assert apart.min() >= 0.8 - 1e-6  # the reference's rule for the last robot would allow .58
+    where = envs.blocks.slices(env.declares.observation)
+    nearest = np.maximum(0, 1 - apart.min(1) / 3)
+    np.testing.assert_allclose(np.asarray(state.obs[:, where["lidar of other robots"]]).max(1), nearest, atol=1e-5)
+    goal = np.linalg.norm(places[:, :2] - np.asarray(state.carry.goals), axis=1)
+    np.testing.assert_allclose(np.asarray(state.obs[:, where["lidar of own goal"]]).max(1), 1 - goal / 3, atol=1e-5)
+    raw = {k: np.asarray(x) for k, x in env.raw(state).items()}
+    raw["qpos"][3:5] = raw["qpos"][:2] + 0.1
+    touching = env.step(env.restore(**raw), np.zeros(env.spec.action_mask.shape))
+    assert touching.cost[:2, 0].tolist() == [1, 1] and not np.asarray(touching.info["cost_contact_other_1"]) == 0
+
+
+def test_a_vase_without_a_slot_that_moves_is_counted():
+    env = point_2(vase_slots=2)
+    assert float(standing(env).info["vases_left_out"]) == 0
+    moving = standing(env, qvel={6 + 6 * v: 0.1 for v in (1, 4, 7)})
+    assert float(moving.info["vases_left_out"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "says"),
+    [
+        ("point_0", {"hazards": 3}, "level 0 has neither hazards nor vases"),
+        ("point_0", {"cost": "kinds"}, "cost = kinds has no kinds at level 0"),
+        ("point_1", {"num_agents": 3}, "wiring = reference has 2 agents, not 3; take wiring = own"),
+        ("point_1", {"num_agents": 9, "wiring": "own"}, "num_agents must be 2 to 8, not 9"),
+        ("ant_1", {"groups": "reference", "wiring": "own"}, "groups = reference cuts up one ant"),
+        ("point_1", {"wiring": "onw"}, "unknown wiring 'onw'; did you mean 'own'?"),
+        ("point_1", {"lidar_bins": 2}, "lidar_bins must be at least 3, not 2"),
+        ("point_1", {"lidar_range": 0.0}, "lidar_range must be a length above 0 m, not 0.0"),
+        ("point_1", {"size": 0.4}, "size must be more than 0.4 m"),
+        ("point_1", {"hazards": -1}, "hazards must be at least 0, not -1"),
+        ("point_1", {"vase_slots": 0}, "vase_slots must be at least 1, not 0"),
+        ("point_0", {"physics": "fused"}, "physics 'fused' cannot step this model"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
+    with pytest.raises(TaskError) as error:
+        envs.make(f"multi_goal_{name}", **options)
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_auto_takes_mujoco_on_a_cpu():
+    assert envs.make("multi_goal_point_0").engine == "mujoco"
+
+
+def test_the_seeker_reaches_goals():
+    env: Any = envs.make("multi_goal_point_0", physics="mujoco")
+    act = env.declares.baselines["seeker"]()
+
+    @jax.jit
+    def roll(state):
+        return jax.lax.scan(lambda s, _: ((t := env.step(s, act(s))), (t.reward, t.info["reached"])), state, length=300)
+
+    _, (reward, reached) = roll(env.reset(jax.random.key(0)))
+    assert float(reached.sum()) >= 1 and float(reward.sum()) > 1
