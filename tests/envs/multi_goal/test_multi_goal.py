@@ -247,10 +247,10 @@ def test_what_mujoco_calls_a_contact_is_what_counts():
         data.qpos[6:] = vases.ravel()
         mujoco.mj_fwdPosition(model, data)
         pairs = {frozenset(map(int, contact.geom)) for contact in data.contact[: data.ncon]}
-        by_name = lambda a, b: frozenset((geoms[a], geoms[b])) in pairs  # noqa: E731
-        own = [[f"{i}/ball", f"{i}/arrow"] for i in range(2)]
-        expected = [[any(by_name(g, f"vase{v}") for g in own[i]) for v in range(10)] for i in range(2)]
-        robots = any(by_name(a, b) for a in own[0] for b in own[1])
+        points = [[geoms[f"{i}/ball"], geoms[f"{i}/arrow"]] for i in range(2)]
+        vase = [geoms[f"vase{v}"] for v in range(10)]
+        expected = [[any(frozenset((g, v)) in pairs for g in point) for v in vase] for point in points]
+        robots = any(frozenset((a, b)) in pairs for a in points[0] for b in points[1])
         vase_touches, robot_touches = touches(jnp.asarray(data.qpos, jnp.float32))
         np.testing.assert_array_equal(vase_touches, expected)
         assert robot_touches.tolist() == [robots] * 2
