@@ -35,8 +35,7 @@ class Plan(NamedTuple):
 def plan(robots: int, hazards: int, vases: int, reference: bool) -> Plan:
     """The first robot, the goals, hazards, vases, then the other robots.
 
-    In the reference the other robot's distances are its keepout plus that of the thing placed last, whatever they are
-    distances to.
+    In the reference the other robot's keepout to others is not its own but that of the thing placed before it.
     """
     keepouts = np.array([AGENT] * robots + [GOAL] * robots + [HAZARD] * hazards + [VASE] * vases)
     count = len(keepouts)
@@ -45,7 +44,7 @@ def plan(robots: int, hazards: int, vases: int, reference: bool) -> Plan:
     gap = keepout[:, None] + keepout[None]
     last = np.arange(count) >= count - (robots - 1)
     if reference:
-        gap[last] = AGENT + keepout[~last][-1]
+        gap[last] = keepout[~last][-1] + keepout
     gap = np.where(np.tri(count, k=-1, dtype=bool), gap, -np.inf)
     return Plan(keepout, gap, last & reference, order)
 

@@ -1,4 +1,4 @@
-"""Layouts and new goals: laws of each, and statistics against 300 recorded resets of the reference."""
+"""Layouts and new goals: laws of each, and statistics against 400 recorded resets of the reference."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def least_slack(places: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray
     slack = apart - radius[:, None] - radius
     others = np.delete(np.arange(len(radius)), 1)
     last = GOAL if number == 0 else VASE
-    return slack[:, others][:, :, others].min((1, 2)), (apart[:, 1, others] - AGENT - last).min(1)
+    return slack[:, others][:, :, others].min((1, 2)), (apart[:, 1, others] - radius[others] - last).min(1)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
@@ -53,7 +53,9 @@ def test_layouts_keep_the_rules_and_look_like_the_recorded_ones(number):
     room = level.size - keepouts(2, level.hazards, level.vases)
     assert (np.abs(ours) <= room[:, None] + 1e-6).all() and (np.abs(theirs) <= room[:, None] + 1e-5).all()
     slack, slack_of_last = least_slack(ours, number)
-    assert (slack >= -1e-5).all() and not crowded.any() and (least_slack(theirs, number)[0] >= -1e-5).all()
+    assert (slack >= -1e-5).all() and not crowded.any()
+    # In 6 of 400 recorded layouts of level 0 the blue goal is too near to robot 0 or to red, which no rule explains.
+    assert (least_slack(theirs, number)[0] < -1e-5).mean() == (0.015 if number == 0 else 0)
     broken = [(least_slack(x, number)[1] < -1e-5).mean() for x in (ours, theirs)]
     assert abs(broken[0] - broken[1]) < 0.08, broken  # 13 % at level 0, hardly any at 1 and 2
     assert (slack_of_last < -1e-5).any() == (number == 0)
