@@ -22,6 +22,7 @@ BATCH = 4
 ALL = [name for name in envs.names() if not name.startswith("hand_over_") or name == "hand_over_2x6"]
 SIBLINGS = {"ant_4x2", "voltage_141"}  # of tasks whose code is the same
 SIBLINGS |= {name for name in ALL if name.startswith("velocity_") and name != "velocity_hopper_3x1"}
+SIBLINGS |= {name for name in ALL if name.startswith("multi_goal_") and name != "multi_goal_point_0"}
 
 
 def each_task(*full: str, siblings: pytest.MarkDecorator = pytest.mark.full):
