@@ -172,7 +172,8 @@ def stepped(task, action=0.0, hazard=(1.8, 1.8), qpos=None, qvel=None, owner=0):
     """Points at rest in corners of an empty world, but for what the arguments say, after a step.
 
     Args:
-      hazard: where the first one is; qpos, qvel: entries, by number, that are not as they would be; owner: of all vases.
+      hazard: where the first one is; qpos, qvel: entries, by number, that are not as they would be.
+      owner: of all vases.
     """
     env, restore, step, _ = task
     vases = env._vases.count
@@ -195,11 +196,18 @@ def stepped(task, action=0.0, hazard=(1.8, 1.8), qpos=None, qvel=None, owner=0):
     return jax.tree.map(lambda x: x[0], step(before, same(action)))
 
 
-def test_agents_of_the_reference_share_the_points_motors_and_own_ones_do_not():
-    driven = [stepped(task, [[1.0, -1.0], [0.0, 0.0]]) for task in (made(*POINT_2), own())]
-    shared, alone = (state.carry.physics.qvel for state in driven)
-    assert shared[0] > 1e-3 and shared[3] < -1e-3 and abs(shared[2]) < 1e-6  # agent 0 drives both
-    assert alone[0] > 1e-3 and alone[2] < -1e-3 and abs(alone[3:6]).max() < 1e-6  # agent 0 drives and turns its own
+THRUST = [[1.0, -1.0], [0.0, 0.0]]
+
+
+def test_agents_of_the_reference_share_the_points_motors():
+    qvel = stepped(made(*POINT_2), THRUST).carry.physics.qvel
+    assert qvel[0] > 1e-3 and qvel[3] < -1e-3 and abs(qvel[2]) < 1e-6  # agent 0 drives both, agent 1 turns none
+
+
+@pytest.mark.full
+def test_own_agents_drive_and_turn_their_own_points():
+    qvel = stepped(own(), THRUST).carry.physics.qvel
+    assert qvel[0] > 1e-3 and qvel[2] < -1e-3 and abs(qvel[3:6]).max() < 1e-6
 
 
 def test_costs_are_the_agents_own():
@@ -256,7 +264,8 @@ def test_observations_are_standardised_over_their_own_entries():
     np.testing.assert_allclose(state, (y - y.mean()) / y.std(), atol=1e-5)
 
 
-@pytest.mark.parametrize("agents", [2, pytest.param(5, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("agents", [2, 5])
 def test_own_robots_see_each_other_and_pay_for_touching(agents):
     env, _, step, reset = own(agents)
     start = reset(jax.random.split(jax.random.key(2), 64))
