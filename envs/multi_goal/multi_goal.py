@@ -403,8 +403,8 @@ class MultiGoal:
     def _get_costs(self, physics: PhysicsState, before: Carry) -> tuple[dict[str, jax.Array], jax.Array]:
         """The four kinds of cost, each [N] 0 or 1, and the vases' owners [V] after the step."""
         robots = self._robots(physics.qpos)
-        none, owner = jnp.zeros(self.num_agents, bool), before.vase_owner
-        found = dict.fromkeys(KINDS, none)
+        found: dict[str, jax.Array] = {kind: jnp.zeros(self.num_agents, bool) for kind in KINDS}
+        owner = before.vase_owner
         if "hazards" in self.charges and self.num_hazards:
             apart = jnp.sqrt(jnp.sum((robots[:, None, :2] - before.hazards) ** 2, axis=2))
             found["hazards"] = (apart < IN_HAZARD).any(1)
