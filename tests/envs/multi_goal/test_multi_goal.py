@@ -384,6 +384,30 @@ def test_auto_takes_mujoco_on_a_cpu():
     assert envs.make("multi_goal_point_0").engine == "mujoco"
 
 
+def test_a_picture_shows_goals_hazards_lidars_and_who_pays():
+    env, *_ = made(*POINT_2)
+    paying = stepped(made(*POINT_2), hazard=(-1.6, -1.5))
+    calm = stepped(made(*POINT_2))
+    counts, marks = [], []
+    for state in (calm, paying):
+        raw = {name: np.asarray(x) for name, x in jax.jit(env.declares.picture.raw)(state).items()}
+        data = mujoco.MjData(env.model)
+        data.qpos[:] = raw["qpos"]
+        mujoco.mj_forward(env.model, data)
+        scene, view = mujoco.MjvScene(env.model, maxgeom=500), mujoco.MjvCamera()
+        mujoco.mjv_updateScene(env.model, data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
+        before = scene.ngeom
+        env.decorate(scene, raw, 0.0)
+        added = scene.geoms[before : scene.ngeom]
+        discs = [g for g in added if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
+        marks.append(len(added) - len(discs))
+        assert marks[-1] == np.count_nonzero(raw["hazard_lidar"])
+        np.testing.assert_allclose([discs[0].pos[:2], discs[1].pos[:2]], raw["goals"], atol=1e-6)
+        counts.append(len(discs))
+    assert counts == [12, 13]  # two goals and ten hazards, and a disc below the robot that pays
+    assert marks[0] == 0 < marks[1]  # all hazards of the first are out of reach
+
+
 @pytest.mark.full
 def test_the_seeker_reaches_goals():
     env: Any = envs.make("multi_goal_point_0", physics="mujoco")
