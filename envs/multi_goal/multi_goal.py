@@ -383,8 +383,8 @@ class MultiGoal:
         qvel, qacc = (x[: self._vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
         parts = [jax.vmap(sense)(robots, qvel, qacc)]
         if self.own:
-            own_goals = jnp.stack([self._lidar(bodies, goal[None])[i] for i, goal in enumerate(carry.goals)])
-            parts += [own_goals, self._lidar_of_others(bodies, carry.goals)]
+            to_goal = jax.vmap(lambda body, goal: lidar(goal[None], body, self._bins, self._range))
+            parts += [to_goal(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
         else:
             parts += [self._lidar(bodies, goal[None]) for goal in carry.goals]
         if self.level:
