@@ -18,7 +18,7 @@ import pytest
 import envs.physics.fused
 from envs.physics.fused import threads
 from envs.physics.fused.model import Tables
-from places import ROOT
+from paths import ROOT
 
 COMPILER = next((path for name in ("g++", "c++", "clang++") if (path := shutil.which(name))), None)
 compiled = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")

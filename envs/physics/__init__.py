@@ -64,6 +64,7 @@ def make_engine(
     *,
     substeps: int,
     readout: Readout,
+    forward: bool = False,
     physics: str = "auto",
     threads: int | None = None,
     contacts: int | None = None,
@@ -72,8 +73,10 @@ def make_engine(
 
     Args:
       model: a compiled model; it is copied, never changed.
-      substeps: integration steps in a control step.
+      substeps: integration steps in a control step; 0, with `forward`, leaves the state as it is.
       readout: derived arrays to return, e.g. `{"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}`.
+      forward: a step ends with a forward pass at the new state under the same controls, and readouts are of that state,
+        not of the last substep.
       physics: `auto` or one of `ENGINES`; `auto` takes the fastest for the device (`engine.name` says which).
       threads: of `fused` and `mujoco`; the process's usable CPUs if None.
       contacts: of `fused` and `warp`: room for so many contacts in a world; derived from the model if None.
@@ -81,7 +84,7 @@ def make_engine(
     Raises:
       TaskError: unknown engine, or one that cannot run here, or not with this model.
     """
-    chosen = resolve(physics, model, readout)
+    chosen = resolve(physics, model, readout, forward)
     if model.na or model.nmocap:
         raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
     model = copy.copy(model)
@@ -95,15 +98,15 @@ def make_engine(
         except NoLibrary as error:
             if physics != "auto":
                 raise TaskError(f"physics 'fused' {error}") from error
-            chosen = resolve("auto", model, readout)
+            chosen = resolve("auto", model, readout, forward)
     if chosen == "mujoco":
         from .c_engine import CEngine
 
-        return CEngine(model, substeps, readout, threads)
+        return CEngine(model, substeps, readout, threads, forward)
     if chosen == "warp":
         from .warp_engine import WarpEngine
 
-        return WarpEngine(model, substeps, readout, contacts)
+        return WarpEngine(model, substeps, readout, contacts, forward)
     from .mjx_engine import MjxEngine
 
-    return MjxEngine(model, substeps, readout)
+    return MjxEngine(model, substeps, readout, forward)

@@ -96,6 +96,35 @@ def test_c_engine_is_a_plain_loop_over_mujoco(readout):
 
 
 @both
+@pytest.mark.parametrize("substeps", [0, 3])
+def test_a_forward_pass_makes_readouts_those_of_the_new_state(readout, substeps):
+    state, ctrl = starts(3)
+    readout = {**readout, "acceleration": ("qacc", slice(None))}
+    made = physics.make_engine(corridor.model(), substeps=substeps, readout=readout, forward=True, physics="mujoco")
+    after, out = jax.vmap(made.step)(state, ctrl)
+    model = corridor.model()
+    data = mujoco.MjData(model)
+    for i in range(3):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state.qpos[i], state.qvel[i], ctrl[i]
+        mujoco.mj_step(model, data, substeps)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
+        np.testing.assert_array_equal(after.qpos[i], data.qpos.astype(np.float32))
+        for name, (field, index) in readout.items():
+            np.testing.assert_array_equal(out[name][i], getattr(data, field)[index].astype(np.float32))
+    np.testing.assert_array_equal(out["torso"], after.qpos[:, :3])  # which RK4 alone leaves a stage behind
+
+
+def test_fused_has_no_forward_pass_and_auto_takes_another():
+    reason = contract.obstacle("fused", corridor.model(), {}, forward=True)
+    assert reason is not None and ("no forward pass" in reason or "compiler" in reason)
+    assert physics.resolve("auto", corridor.model(), {}, forward=True) == "mujoco"
+    with pytest.raises(TaskError, match="physics 'fused' "):
+        physics.make_engine(corridor.model(), substeps=5, readout={}, forward=True, physics="fused")
+
+
+@both
 def test_broken_rows_stay_broken_and_leave_their_neighbours_alone(readout, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     state, ctrl = starts(8)
