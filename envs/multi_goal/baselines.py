@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
-from ..base import Policy, State
+from ..base import Controller, State
 
 if TYPE_CHECKING:
     from .multi_goal import MultiGoal
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
 AHEAD = 0.4  # rad off its goal, within which a point drives on
 
 
-def policies(env: MultiGoal) -> dict[str, Callable[[], Policy]]:
+def policies(env: MultiGoal) -> dict[str, Callable[[], Controller]]:
     """By name."""
     known = {"zero": lambda: _zero(env), "random": lambda: _random(env)}
     return known | ({"seeker": lambda: _seeker(env)} if env.robot == "point" else {})
 
 
-def _zero(env: MultiGoal) -> Policy:
+def _zero(env: MultiGoal) -> Controller:
     return lambda state: jnp.zeros(env.spec.action_mask.shape, state.obs.dtype)
 
 
-def _random(env: MultiGoal) -> Policy:
+def _random(env: MultiGoal) -> Controller:
     """Uniform in [-1, 1], drawn from the state's own key."""
     return lambda state: jax.random.uniform(
         jax.random.fold_in(state.carry.key, 1), env.spec.action_mask.shape, state.obs.dtype, -1.0, 1.0
     )
 
 
-def _seeker(env: MultiGoal) -> Policy:
+def _seeker(env: MultiGoal) -> Controller:
     """Turns to the goal, and drives on while it is ahead; it sees neither hazards nor vases."""
 
     def policy(state: State) -> jax.Array:

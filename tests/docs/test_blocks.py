@@ -28,7 +28,7 @@ from pmt_jax.studies import table
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```(bash|python|toml)\n(.*?)```", re.DOTALL)
-SLOW = {
+SLOW = {"multi_goal", "own_loop", "own_method", "voltage"}  # pages without shell blocks that compile for seconds
     "multi_goal",
     "own_loop",
     "own_method",
