@@ -100,7 +100,7 @@ def make_engine(
         _cut_solver(model, fast_contacts)
     # Each engine's module is imported when it is first built: warp needs packages that the others do without.
     if chosen == "fused":
-        from .fused.cpu import NoLibrary
+        from ..native import NoLibrary
         from .fused_engine import FusedEngine
 
         try:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from ..config.settings import Config
 from ..tasks import EnvSpec
+from . import fused
 from .maths import distributions
 from .types import Params
 
@@ -76,6 +77,7 @@ class Networks:
     Attributes:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
+      fused: whether C++ code computes them (see `fused`).
     """
 
     num_actors: int
@@ -88,6 +90,12 @@ class Networks:
     cost_critic: MLP
     fear_net: MLP
     regret_net: MLP
+    fused: bool = False
+
+    @property
+    def in_fit(self) -> Networks:
+        """The same functions for a fit: as fast as this machine has them, with one gradient of weights and no other."""
+        return dataclasses.replace(self, fused=fused.available())
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -134,6 +142,9 @@ class Networks:
 
     def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
+        if self.fused:
+            layers = params["params"]
+            return self._apply(self.actor.trunk, {"params": layers["trunk"]}, obs), distributions.std(layers["std"])
         return self.actor.apply(params, obs)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
 
     def policies(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -167,26 +178,25 @@ class Networks:
 
     def value(self, params: Params, state: jax.Array) -> jax.Array:
         """V in normalised units: state [..., S] -> [...]."""
-        return _apply(self.critic, params, state)[..., 0]
+        return self._apply(self.critic, params, state)[..., 0]
 
     def cost_value(self, params: Params, state: jax.Array) -> jax.Array:
         """Vc in normalised units: state [..., S] -> [..., N, K]."""
-        heads = _apply(self.cost_critic, params, state)
+        heads = self._apply(self.cost_critic, params, state)
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
     def fear(self, params: Params, state: jax.Array) -> jax.Array:
         """Logits of the fear prior network: state [..., S] -> [..., N, K]."""
-        heads = _apply(self.fear_net, params, state)
+        heads = self._apply(self.fear_net, params, state)
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
     def regret(self, params: Params, state: jax.Array, action: jax.Array) -> jax.Array:
         """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
-        return _apply(self.regret_net, params, jnp.concatenate([state, action], -1))
+        return self._apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
-
-def _apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
-    out: Any = module.apply(params, x)
-    return out
+    def _apply(self, module: MLP, params: Params, x: jax.Array) -> jax.Array:
+        out: Any = fused.apply(module, params, x) if self.fused else module.apply(params, x)
+        return out
 
 
 def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:

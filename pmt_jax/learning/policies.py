@@ -186,8 +186,10 @@ def _clipped_epochs(
 ) -> tuple[TrainState, Metrics]:
     """Epochs of clipped policy gradient (PPO)."""
 
+    nets = setup.nets.in_fit
+
     def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
-        mean, std = setup.nets.policy(params, rows.obs)
+        mean, std = nets.policy(params, rows.obs)
         log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
         gain = clipped_surrogate(log_ratio, rows.log_weight, rows.advantage, rows.factor, hyper.clip)
         entropy = distributions.entropy(std, rows.mask).mean()

@@ -22,7 +22,9 @@ from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
 from envs.physics.contract import PhysicsState
+from envs import native
 from envs.physics.fused import cpu
+from envs.physics.fused.header import header
 from envs.physics.fused import model as tables_of
 from envs.physics.fused_engine import FusedEngine
 from envs.velocity import robots
@@ -481,14 +483,18 @@ def fresh(monkeypatch, tmp_path):
     (tmp_path / "cache").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setattr(cpu.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(cpu, "_failures", [])
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(native, "_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(native, "_failures", {})
     return tmp_path / "bin"
 
 
+def small_code(*bodies: str) -> native.Code:
+    return cpu.code(header(tables_of.tables(small(*bodies), 1, {})))
+
+
 def real_compiler() -> str:
-    return next(cpu.compilers()).command[0]
+    return next(native.compilers()).command[0]
 
 
 def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli):
@@ -510,7 +516,7 @@ def test_compilers_that_do_not_work_end_in_mujoco_and_a_sentence(fresh, text):
     assert "could not be compiled" in tasks.advice(env) and "c++" in tasks.advice(env)
     with pytest.raises(TaskError, match="physics 'fused' could not be compiled"):
         envs.make("ant_2x4", physics="fused")
-    assert not list(cpu._folder().iterdir()), "it left something behind"
+    assert not list(native._folder().iterdir()), "it left something behind"
 
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, "exit 1"], ids=["fails", "writes garbage", "is no compiler"])
@@ -518,33 +524,33 @@ def test_after_a_compiler_that_does_not_work_the_next_one_is_taken(fresh, text, 
     monkeypatch.undo()
     compiler = real_compiler()
     monkeypatch.setenv("CXX", str(script(fresh, "mine", text)))
-    monkeypatch.setattr(cpu, "_folder", lambda: fresh.parent / "cache")
+    monkeypatch.setattr(native, "_folder", lambda: fresh.parent / "cache")
     lines = []
     with tasks.announcing(lines.append):
-        path = cpu.library(tables_of.tables(small(), 1, {}))
+        path = native.library(small_code())
     assert path.exists() and lines[-1] == f"compiling the physics ({compiler}) ..."
     with tasks.announcing(lines.append):
-        assert cpu.library(tables_of.tables(small(), 1, {})) == path
+        assert native.library(small_code()) == path
     assert lines[-1] != f"compiling the physics ({compiler}) ..." or len(lines) <= 2
 
 
 def test_the_key_of_the_cache_has_all_that_the_library_depends_on(monkeypatch):
-    compiler, text = next(cpu.compilers()), "tables"
-    keys = [cpu._key(compiler, text, "double"), cpu._key(compiler, "other tables", "double")]
-    keys += [cpu._key(compiler, text, "float"), cpu._key(compiler._replace(version="2"), text, "double")]
-    monkeypatch.setattr(cpu, "cpu_flags", lambda: "of another CPU")
-    keys.append(cpu._key(compiler, text, "double"))
+    compiler, code = next(native.compilers()), cpu.code("tables", "double")
+    keys = [native._key(compiler, code), native._key(compiler, cpu.code("other tables", "double"))]
+    keys += [native._key(compiler, cpu.code("tables", "float")), native._key(compiler._replace(version="2"), code)]
+    monkeypatch.setattr(native, "cpu_flags", lambda: "of another CPU")
+    keys.append(native._key(compiler, code))
     monkeypatch.setattr(jax.lib, "__version__", "0.0.1")
-    keys.append(cpu._key(compiler, text, "double"))
+    keys.append(native._key(compiler, code))
     assert len(set(keys)) == len(keys)
 
 
 def test_a_damaged_library_is_compiled_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path)
-    made = tables_of.tables(small("<body><joint/><geom size='.2'/></body>"), 1, {})
-    path = cpu.library(made)
+    monkeypatch.setattr(native, "_folder", lambda: tmp_path)
+    made = small_code("<body><joint/><geom size='.2'/></body>")
+    path = native.library(made)
     path.write_bytes(b"half a libr")
-    assert cpu.library(made) == path and path.stat().st_size > 1000
+    assert native.library(made) == path and path.stat().st_size > 1000
 
 
 STEP = """
