@@ -30,7 +30,7 @@ from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training import jobs
 from pmt_jax.training.compile import compile_run
 
-from . import grid, once, plain, substep
+from . import grid, once, plain, substep, update
 from .cases import Bench, Build, Case, Program
 from .records import Row
 
@@ -174,6 +174,7 @@ ONCE = {
     "baseline": once.baseline,
     "certificate": once.certificate,
     "substep": substep.substep,
+    "update": update.update,
 }
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 

@@ -116,7 +116,7 @@ def _asked(command: tuple[str, ...]) -> tuple[Compiler, ...]:
 
 
 def obstacle(name: str) -> str | None:
-    """Why a library cannot be compiled here, as the rest of a sentence; None if a compiler is there and has not failed."""
+    """Why a library cannot be made here, the rest of a sentence; None if a compiler is there and has not failed."""
     if name in _failures:
         return f"could not be compiled: {_failures[name]} ({INSTALL})"
     if next(compilers(), None) is None:

@@ -13,7 +13,7 @@ from .constraint import respond
 from .maths import distributions
 from .maths.advantages import standardise
 from .maths.losses import clipped_surrogate, hybrid_advantage
-from .optimise import fit
+from .optimise import Loss, fit
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_steps
@@ -186,6 +186,15 @@ def _clipped_epochs(
 ) -> tuple[TrainState, Metrics]:
     """Epochs of clipped policy gradient (PPO)."""
 
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
+    new, metrics = fit(net, clipped_loss(setup, hyper), rows, key, **limits, **passes)
+    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, rows)
+    return TrainState(params, new.opt_state), metrics
+
+
+def clipped_loss(setup: Setup, hyper: Hyper) -> Loss:
+    """What `_clipped_epochs` minimise, of one policy's weights and rows [R, ...]."""
     nets = setup.nets.in_fit
 
     def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
@@ -197,10 +206,7 @@ def _clipped_epochs(
         metrics = {"entropy": entropy, "clipped": outside.mean(), "std": (std * rows.mask).sum() / rows.mask.sum()}
         return -gain.mean() - hyper.entropy_coef * entropy, metrics
 
-    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    new, metrics = fit(net, loss, rows, key, learning_rate=now.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
-    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, rows)
-    return TrainState(params, new.opt_state), metrics
+    return loss
 
 
 def _limit_kl(

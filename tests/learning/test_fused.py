@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native import compiled
 
 from envs import native
+from native import compiled
 from pmt_jax import METHODS, load_config
 from pmt_jax.learning import fused, learner
 from pmt_jax.learning.networks import MLP

@@ -18,14 +18,13 @@ import numpy as np
 import pytest
 
 import envs
-from envs import physics
+from envs import native, physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
 from envs.physics.contract import PhysicsState
-from envs import native
 from envs.physics.fused import cpu
-from envs.physics.fused.header import header
 from envs.physics.fused import model as tables_of
+from envs.physics.fused.header import header
 from envs.physics.fused_engine import FusedEngine
 from envs.velocity import robots
 from native import compiled
