@@ -151,5 +151,5 @@ def kernels(program: str) -> int:
         return 0
     found = re.search(rf"^%?{re.escape(body[1])} .*?\{{\n(.*?)^\}}", program, re.MULTILINE | re.DOTALL)
     lines = found[1].splitlines() if found else []
-    kinds = [match[1] for line in lines if (match := re.search(r"= \S+ ([\w\-]+)\(", line))]
+    kinds = [match[1] for line in lines if (match := re.search(r"= (?:\(.*?\)|\S+) ([\w\-]+)\(", line))]
     return sum(kind not in _NOT_LAUNCHED and not kind.endswith("-done") for kind in kinds)

@@ -23,20 +23,25 @@ _GAINS = {"relu": math.sqrt(2), "tanh": 5 / 3, "elu": 1.0}
 
 
 class LayerNorm(nn.Module):
-    """Zero mean and unit variance over the last axis, then a learned scale and bias.
-
-    As `nn.LayerNorm`, with the means taken by matrix products: on a CPU, XLA multiplies faster than it sums, which is
-    worth 8 % of an update.
-    """
+    """Zero mean and unit variance over the last axis, then a learned scale and bias, as `nn.LayerNorm`."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         width = x.shape[-1]
         scale = self.param("scale", nn.initializers.ones, (width,))
         bias = self.param("bias", nn.initializers.zeros, (width,))
-        mean_of = jnp.full((width, 1), 1 / width, x.dtype)
-        centred = x - x @ mean_of
-        return centred * jax.lax.rsqrt((centred * centred) @ mean_of + NORM_EPS) * scale + bias
+        centred = x - _mean(x)
+        return centred * jax.lax.rsqrt(_mean(centred * centred) + NORM_EPS) * scale + bias
+
+
+def _mean(x: jax.Array) -> jax.Array:
+    """The mean over the last axis, [..., 1]; on a CPU by a matrix product.
+
+    There XLA multiplies faster than it sums, which was worth 8 % of an update. A GPU's updates took 6 % longer for it.
+    """
+    if jax.default_backend() != "cpu":
+        return x.mean(-1, keepdims=True)
+    return x @ jnp.full((x.shape[-1], 1), 1 / x.shape[-1], x.dtype)
 
 
 class MLP(nn.Module):

@@ -50,7 +50,7 @@ inline void task(void* data, int phase, long index) {
   const float shrink = bound < 1 ? bound : bound != bound ? bound : 1;
   const int32_t steps = call.count[n] < INT32_MAX ? call.count[n] + 1 : INT32_MAX;
   const float first_share = 1 - __builtin_powf(FIRST, (float)steps), second_share = 1 - __builtin_powf(SECOND, (float)steps);
-  const float rate = call.rate[n];
+  const float rate = call.rate[n], first_scale = 1 / first_share, second_scale = 1 / second_share;
   const float *p = call.from[0][leaf] + at, *m = call.from[1][leaf] + at, *v = call.from[2][leaf] + at;
   float *to_p = call.to[0][leaf] + at, *to_m = call.to[1][leaf] + at, *to_v = call.to[2][leaf] + at;
 #pragma GCC ivdep
@@ -58,7 +58,7 @@ inline void task(void* data, int phase, long index) {
     const float each = g[i] * shrink;
     const float mean = (1 - FIRST) * each + FIRST * m[i], square = (1 - SECOND) * (each * each) + SECOND * v[i];
     to_m[i] = mean, to_v[i] = square;
-    to_p[i] = p[i] - rate * (mean / first_share / (__builtin_sqrtf(square / second_share) + EPS));
+    to_p[i] = p[i] - rate * (mean * first_scale / (__builtin_sqrtf(square * second_scale) + EPS));
   }
   if (part == 0) call.norm[n] = norm, call.next_count[n] = steps;
 }

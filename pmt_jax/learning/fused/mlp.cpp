@@ -132,6 +132,7 @@ void backward_task(void* data, int phase, long index) {
 // names: activation, input_norm, layer_norm, layers.
 bool read(const XLA_FFI_CallFrame* frame, long first, Call& call) {
   Shape& shape = call.shape;
+  if (frame->attrs.size != 4) return false;
   call.activation = native::attribute(frame, 0);
   shape.input_norm = native::attribute(frame, 1), shape.layer_norm = native::attribute(frame, 2);
   shape.layers = native::attribute(frame, 3);
