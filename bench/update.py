@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import re
 import statistics
@@ -53,6 +54,7 @@ class _without_code:
 def _row(case: Case, network: str) -> Row:
     config = load_config(case.task, method=case.method, num_envs=case.num_envs, rollout_length=case.rollout_length)
     setup = make_setup(config)
+    setup = dataclasses.replace(setup, nets=setup.nets.fast)
     steps = config.epochs * config.minibatches
     loops = {name: loop.lower().compile() for name, loop in _loops(setup, network).items()}
     turns: dict[str, list[float]] = {name: [] for name in loops}
@@ -126,7 +128,7 @@ def _draw(*shapes: tuple[int, ...]) -> list[jax.Array]:
 def _critic(setup: Setup) -> Fit:
     count = setup.config.batch_size
     state, old, target = _draw((count, setup.nets.state_dim), (count,), (count,))
-    loss = critics.loss_of(setup.nets.in_fit.value, setup.hyper.clip)
+    loss = critics.loss_of(setup.nets.value, setup.hyper.clip)
     return setup.nets.init_critic(jax.random.key(2)), loss, (state, old, target)
 
 

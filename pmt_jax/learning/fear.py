@@ -35,12 +35,11 @@ def appraise_fear(
     net = dataclasses.replace(net, params=setup.nets.awaken_fear(net.params, batch.cost.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     rows = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
-    nets = setup.nets.in_fit
     noise = jax.random.logistic(jax.random.fold_in(key, 2), rows[1].shape)
 
     def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, cost, old, noise = rows
-        logits = nets.fear(params, state)
+        logits = setup.nets.fear(params, state)
         distance = divergence(logits, cost, setup.config.fear_loss, noise, hyper.temperature)
         return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
 

@@ -109,6 +109,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
 
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
+    setup = dataclasses.replace(setup, nets=setup.nets.fast)
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
     now = schedules.at(setup.config, hyper, state.update)
@@ -141,12 +142,12 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
     rows, cost_rows = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
-    fit_critic, nets = partial(critics.fit_critic, setup, hyper, now), setup.nets.in_fit
+    fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     held = dataclasses.replace(held, estimate=estimate)
     fitted = sharding.side_by_side(
-        partial(fit_critic, state.critic, nets.value, hyper.clip, rows, tagged[Tag.CRITIC]),
-        partial(fit_critic, state.cost_critic, nets.cost_value, cost_clip, cost_rows, tagged[Tag.COST_CRITIC]),
+        partial(fit_critic, state.critic, setup.nets.value, hyper.clip, rows, tagged[Tag.CRITIC]),
+        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_rows, tagged[Tag.COST_CRITIC]),
         partial(update_policies, setup, hyper, now, state.actor, held, actor_rows, excess, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, held, actor_metrics) = fitted

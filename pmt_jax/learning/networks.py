@@ -82,7 +82,7 @@ class Networks:
     Attributes:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
-      fused: whether C++ code computes them (see `fused`).
+      fused: whether C++ code computes them where it can (see `fused`).
     """
 
     num_actors: int
@@ -98,9 +98,18 @@ class Networks:
     fused: bool = False
 
     @property
-    def in_fit(self) -> Networks:
-        """The same functions for a fit: as fast as this machine has them, with one gradient of weights and no other."""
-        return dataclasses.replace(self, fused=fused.available())
+    def fast(self) -> Networks:
+        """The same functions as fast as this machine has them; weights have one gradient, and no other derivative."""
+        return dataclasses.replace(self, fused=True)
+
+    @property
+    def plain(self) -> Networks:
+        """The same functions by XLA, with all their derivatives."""
+        return dataclasses.replace(self, fused=False)
+
+    @property
+    def _compiled(self) -> bool:
+        return self.fused and fused.available()
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -147,7 +156,7 @@ class Networks:
 
     def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
-        if self.fused:
+        if self._compiled:
             layers = params["params"]
             return self._apply(self.actor.trunk, {"params": layers["trunk"]}, obs), distributions.std(layers["std"])
         return self.actor.apply(params, obs)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
@@ -200,7 +209,7 @@ class Networks:
         return self._apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
     def _apply(self, module: MLP, params: Params, x: jax.Array) -> jax.Array:
-        out: Any = fused.apply(module, params, x) if self.fused else module.apply(params, x)
+        out: Any = fused.apply(module, params, x) if self._compiled else module.apply(params, x)
         return out
 
 

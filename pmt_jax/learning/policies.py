@@ -195,10 +195,9 @@ def _clipped_epochs(
 
 def clipped_loss(setup: Setup, hyper: Hyper) -> Loss:
     """What `_clipped_epochs` minimise, of one policy's weights and rows [R, ...]."""
-    nets = setup.nets.in_fit
 
     def loss(params: Params, rows: PolicyRows) -> tuple[jax.Array, Metrics]:
-        mean, std = nets.policy(params, rows.obs)
+        mean, std = setup.nets.policy(params, rows.obs)
         log_ratio = distributions.log_prob(rows.action, mean, std, rows.mask) - rows.log_prob
         gain = clipped_surrogate(log_ratio, rows.log_weight, rows.advantage, rows.factor, hyper.clip)
         entropy = distributions.entropy(std, rows.mask).mean()

@@ -33,11 +33,9 @@ def appraise_regret(
     rows = (state, batch.action, target, jax.nn.sigmoid(before), costly)
     rows = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), rows)
 
-    nets = setup.nets.in_fit
-
     def loss(params: Params, rows: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, action, target, old, weight = rows
-        logits = nets.regret(params, state, action)
+        logits = setup.nets.regret(params, state, action)
         return appraisal_loss(cross_entropy(logits, target), logits, old, weight, hyper.regret_l2), {}
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))

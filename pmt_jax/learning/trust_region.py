@@ -77,10 +77,10 @@ def _trust_region_step(
 
     This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
     """
-    rows = sharding.shard(rows)
+    rows, nets = sharding.shard(rows), setup.nets.plain  # the Fisher matrix takes second derivatives
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return setup.nets.policy(unravel(flat), rows.obs)
+        return nets.policy(unravel(flat), rows.obs)
 
     mean0, std0 = jax.lax.stop_gradient(policy(start))
 

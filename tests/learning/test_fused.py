@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from envs import native
 from native import compiled
-from pmt_jax import METHODS, load_config
+from pmt_jax import METHODS, load_config, tasks
 from pmt_jax.learning import fused, learner
 from pmt_jax.learning.networks import MLP
 from pmt_jax.learning.optimise import fit, init_train_state
@@ -150,14 +150,17 @@ def test_an_update_of_every_method_learns_what_xla_learns(by_xla, task, method):
     assert metrics.keys() == expected[1].keys()
 
 
-def test_without_a_compiler_the_learner_is_xlas(monkeypatch):
+def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeypatch):
     def none(code):
         raise native.NoLibrary("needs a C++ compiler; found none")
 
     monkeypatch.setattr(native, "targets", none)
     fused._targets.cache_clear()
+    lines = []
     try:
-        assert not fused.available()
+        with tasks.announcing(lines.append):
+            assert not fused.available() and not fused.available()
+        assert lines == ["XLA computes the networks, more slowly: their own code needs a C++ compiler; found none"]
         module, params = network(7, (16,), 2)
         fitted(module, params, rows_of(), jax.random.key(0))
     finally:

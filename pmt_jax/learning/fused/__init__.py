@@ -48,12 +48,17 @@ class _Shape:
         numbers |= {"layer_norm": int(self.layer_norm), "input_norm": int(self.input_norm)}
         return {name: np.int64(number) for name, number in numbers.items()}
 
+    @property
+    def packed(self) -> int:
+        """Numbers of the weights as the passes read them (`Packed` in mlp.h)."""
+        layers = zip(self.widths, self.widths[1:], strict=False)
+        return sum(i * _wide(o) + o * _wide(i) + _wide(o) + 3 * _wide(i) for i, o in layers)
+
     def saved(self, rows: int) -> int:
         """Numbers that the forward pass leaves to the backward pass (`Saved` in mlp.h)."""
-        size = rows * _wide(self.widths[-1])
-        for layer, (inputs, outputs) in enumerate(zip(self.widths, self.widths[1:], strict=False)):
+        size = self.packed + rows * _wide(self.widths[-1])
+        for layer, inputs in enumerate(self.widths[:-1]):
             copies = 2 if (self.layer_norm if layer else self.input_norm) else 1
-            size += inputs * _wide(outputs) + outputs * _wide(inputs) + _wide(outputs) + 3 * _wide(inputs)
             size += copies * rows * _wide(inputs) + _wide(2 * rows)
         return size
 
@@ -84,7 +89,8 @@ def _targets() -> list[str] | None:
     code = native.Code("mlp", "the networks", (HERE / "mlp.cpp", *headers, *shared), functions, (), ("REAL=float",))
     try:
         return native.targets(code)
-    except native.NoLibrary:
+    except native.NoLibrary as error:
+        native.announce(f"XLA computes the networks, more slowly: their own code {error}")
         return None
 
 
@@ -116,13 +122,16 @@ def apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _network(shape: _Shape, weights: list[jax.Array], x: jax.Array) -> jax.Array:
-    return _forward(shape, weights, x)[0]
+    return _outputs(shape, weights, x, shape.packed)[0]
+
+
+def _outputs(shape: _Shape, weights: list[jax.Array], x: jax.Array, memory: int) -> list[jax.Array]:
+    results = [jax.ShapeDtypeStruct(size, _F32) for size in ((x.shape[0], shape.widths[-1]), (memory,))]
+    return _call(0, results)(x, *weights, **shape.attributes)
 
 
 def _forward(shape: _Shape, weights: list[jax.Array], x: jax.Array) -> tuple[jax.Array, Any]:
-    rows = x.shape[0]
-    results = [jax.ShapeDtypeStruct(size, _F32) for size in ((rows, shape.widths[-1]), (shape.saved(rows),))]
-    out, saved = _call(0, results)(x, *weights, **shape.attributes)
+    out, saved = _outputs(shape, weights, x, shape.saved(x.shape[0]))
     return out, (weights, saved, x)
 
 

@@ -86,9 +86,14 @@ inline void pack(const float* from, long row, long column, long depth, long widt
   for (long first = 0; first < stride; first += PANEL * LANES) {
     const long columns = least(PANEL * LANES, stride - first);
     float* to = packed + first * depth;
-    for (long k = 0; k < depth; ++k) {
+    const long real = least(columns, width - first);
+    for (long k = 0; column == 1 && k < depth; ++k) {
+      memcpy(to + k * columns, from + k * row + first, real * sizeof(float));
+      for (long j = real; j < columns; ++j) to[k * columns + j] = 0;
+    }
+    for (long k = 0; column != 1 && k < depth; ++k) {
       for (long j = 0; j < columns; ++j) {
-        to[k * columns + j] = first + j < width ? from[k * row + (first + j) * column] : 0;
+        to[k * columns + j] = j < real ? from[k * row + (first + j) * column] : 0;
       }
     }
   }

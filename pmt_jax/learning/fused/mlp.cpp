@@ -44,24 +44,54 @@ void layers_of(const Call& call, long n, Layer* layers, Norm* norms) {
   }
 }
 
+void pack_task(const Call& call, const Packed& packed, long n, long layer) {
+  Layer layers[MOST_LAYERS];
+  Norm norms[MOST_LAYERS + 1];
+  layers_of(call, n, layers, norms);
+  pack_layer(call.shape, layers[layer], norms[layer], packed, layer);
+}
+
+void forward_rows(const Call& call, const Shape& shape, const Saved& saved, const float* x, float* out, long first,
+                  long rows) {
+  if (call.activation == RELU) return forward<RELU>(shape, saved, x, out, first, rows);
+  if (call.activation == TANH) return forward<TANH>(shape, saved, x, out, first, rows);
+  return forward<ELU>(shape, saved, x, out, first, rows);
+}
+
+// Memory of a thread, kept for its next task.
+float* memory(long size) {
+  static thread_local float* block;
+  static thread_local long held;
+  if (held < size) {
+    free(block);
+    block = (float*)aligned_alloc(64, (size * sizeof(float) + 63) / 64 * 64);
+    held = block ? size : 0;
+  }
+  return block;
+}
+
 void forward_task(void* data, int phase, long index) {
   const Call& call = *(const Call*)data;
   const Shape& shape = call.shape;
   const long tasks = phase ? shape.chunks() : shape.layers, n = index / tasks, k = index % tasks;
   Saved saved;
-  saved.place(shape, call.saved + n * call.saved_size);
-  if (phase == 0) {
-    Layer layers[MOST_LAYERS];
-    Norm norms[MOST_LAYERS + 1];
-    layers_of(call, n, layers, norms);
-    return pack_layer(shape, layers[k], norms[k], saved, k);
-  }
+  float* block = call.saved + n * call.saved_size;
+  const long weights = saved.Packed::place(shape, block);
+  if (phase == 0) return pack_task(call, saved, n, k);
   const long first = k * CHUNK, rows = least(CHUNK, shape.rows - first);
   const float* x = call.x + n * shape.rows * shape.width[0];
   float* out = call.out + n * shape.rows * shape.width[shape.layers];
-  if (call.activation == RELU) forward<RELU>(shape, saved, x, out, first, rows);
-  else if (call.activation == TANH) forward<TANH>(shape, saved, x, out, first, rows);
-  else forward<ELU>(shape, saved, x, out, first, rows);
+  if (shape.gradient) {
+    saved.place_rows(shape, block + weights);
+    return forward_rows(call, shape, saved, x, out, first, rows);
+  }
+  Shape here = shape;
+  here.rows = CHUNK;
+  float* own = memory(saved.place_rows(here, nullptr));
+  saved.place_rows(here, own);
+  x += first * shape.width[0], out += first * shape.width[shape.layers];
+  if (own) return forward_rows(call, here, saved, x, out, 0, rows);
+  for (long i = 0; i < rows * shape.width[shape.layers]; ++i) out[i] = NAN;
 }
 
 // The gradient of a kernel in parts: blocks of its rows in panels of its columns, or of its transpose's where fewer of
@@ -161,7 +191,8 @@ bool has(const XLA_FFI_Buffer* buffer, long size) {
 
 }  // namespace
 
-// x [..., R, in] and weights [..., ...] to outputs [..., R, out] and what the backward pass needs [..., saved].
+// x [..., R, in] and weights [..., ...] to outputs [..., R, out] and memory [..., size]: for the packed weights, or with
+// them for all that a backward pass needs. Which of both it is, its size says.
 EXPORTED XLA_FFI_Error* mlp_forward(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   Call call;
@@ -169,7 +200,9 @@ EXPORTED XLA_FFI_Error* mlp_forward(XLA_FFI_CallFrame* frame) {
   Shape& shape = call.shape;
   shape.rows = native::size_of_array(operand(frame, 0)) / (call.networks * shape.width[0]);
   Saved saved;
-  call.saved_size = saved.place(shape, nullptr);
+  call.saved_size = native::size_of_array(result(frame, 1)) / call.networks;
+  shape.gradient = call.saved_size == saved.place(shape, nullptr);
+  if (!shape.gradient) call.saved_size = saved.Packed::place(shape, nullptr);
   call.x = floats(operand(frame, 0));
   call.out = (float*)result(frame, 0)->data, call.saved = (float*)result(frame, 1)->data;
   if (!has(operand(frame, 0), call.networks * shape.rows * shape.width[0]) ||

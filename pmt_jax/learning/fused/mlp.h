@@ -23,6 +23,7 @@ struct Shape {
   long rows, layers;
   long width[MOST_LAYERS + 1];  // of the input, of what each layer gives
   bool layer_norm, input_norm;
+  bool gradient;  // whether a backward pass follows
 
   long chunks() const { return (rows + CHUNK - 1) / CHUNK; }
   bool normed(long layer) const { return layer < 0 ? input_norm : layer_norm && layer + 1 < layers; }
@@ -39,14 +40,11 @@ struct Pieces {
   }
 };
 
-// What the forward pass leaves to the backward pass, of one network.
-struct Saved {
-  float *packed[MOST_LAYERS], *turned[MOST_LAYERS];            // kernels [in, out] and their transposes
-  float *bias[MOST_LAYERS], *ones[MOST_LAYERS + 1];            // ones [width]: 1 in its first columns, 0 in the padding
-  float *scale[MOST_LAYERS + 1], *offset[MOST_LAYERS + 1];     // of the norm before layer l
-  float *active[MOST_LAYERS + 1], *moments[MOST_LAYERS + 1];   // before that norm; mean and 1 / sd [rows, 2]
-  float* input[MOST_LAYERS + 1];                               // of layer l
-  float* head;                                                 // what the last one gives, without its bias
+// Weights as the passes read them, of one network.
+struct Packed {
+  float *packed[MOST_LAYERS], *turned[MOST_LAYERS];         // kernels [in, out] and their transposes
+  float *bias[MOST_LAYERS], *ones[MOST_LAYERS];             // ones [width]: 1 in its first columns, 0 in the padding
+  float *scale[MOST_LAYERS], *offset[MOST_LAYERS];          // of the norm before layer l
 
   // Where everything lies in a block; returns its size.
   long place(const Shape& shape, float* block) {
@@ -59,13 +57,30 @@ struct Saved {
       ones[l] = pieces.take(wide(in));
       scale[l] = pieces.take(wide(in));
       offset[l] = pieces.take(wide(in));
-      input[l] = pieces.take(shape.rows * wide(in));
-      const bool normed = shape.normed(l - 1);
-      active[l] = normed ? pieces.take(shape.rows * wide(in)) : input[l];
+    }
+    return pieces.at - block;
+  }
+};
+
+// What the forward pass leaves to the backward pass, of one network.
+struct Saved : Packed {
+  float *active[MOST_LAYERS], *moments[MOST_LAYERS];  // before the norm before layer l; its mean and 1 / sd [rows, 2]
+  float *input[MOST_LAYERS], *head;                   // of layer l; what the last one gives, without its bias
+
+  long place_rows(const Shape& shape, float* block) {
+    Pieces pieces = {block};
+    for (long l = 0; l < shape.layers; ++l) {
+      const long in = wide(shape.width[l]);
+      input[l] = pieces.take(shape.rows * in);
+      active[l] = shape.normed(l - 1) ? pieces.take(shape.rows * in) : input[l];
       moments[l] = pieces.take(wide(2 * shape.rows));
     }
     head = pieces.take(shape.rows * wide(shape.width[shape.layers]));
     return pieces.at - block;
+  }
+  long place(const Shape& shape, float* block) {
+    const long weights = Packed::place(shape, block);
+    return weights + place_rows(shape, block + weights);
   }
 };
 

@@ -99,10 +99,13 @@ FUNCTION void normalise_back(const Rows& rows, long first, float* gradient, floa
   }
 }
 
-// Kernels as products read them, and vectors with padding. `turned` is needed where a gradient passes the layer.
-inline void pack_layer(const Shape& shape, const Layer& layer, const Norm& before, const Saved& saved, long l) {
+// Kernels as products read them, and vectors with padding. `turned` is needed where a
+// gradient passes the layer.
+inline void pack_layer(const Shape& shape, const Layer& layer, const Norm& before, const Packed& saved, long l) {
   pack(layer.kernel, layer.out, 1, layer.in, layer.out, saved.packed[l]);
-  if (l > 0 || shape.input_norm) pack(layer.kernel, 1, layer.out, layer.out, layer.in, saved.turned[l]);
+  if (shape.gradient && (l > 0 || shape.input_norm)) {
+    pack(layer.kernel, 1, layer.out, layer.out, layer.in, saved.turned[l]);
+  }
   for (long j = 0; j < wide(layer.out); ++j) saved.bias[l][j] = j < layer.out ? layer.bias[j] : 0;
   for (long j = 0; j < wide(layer.in); ++j) {
     const bool real = j < layer.in, normed = shape.normed(l - 1);
