@@ -90,7 +90,7 @@ def make_engine(
     model = copy.copy(model)
     # Each engine's module is imported when it is first built: warp needs packages that the others do without.
     if chosen == "fused":
-        from .fused.cpu import NoLibrary
+        from ..native import NoLibrary
         from .fused_engine import FusedEngine
 
         try:

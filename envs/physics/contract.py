@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from .. import native
 from ..errors import TaskError, one_of
 from ..versions import installed_version
 
@@ -136,9 +137,7 @@ def _fused_obstacle(
     if reason:
         return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
     if on_cpu:
-        from .fused import cpu  # with its compilers, only if it is asked for
-
-        return cpu.obstacle()
+        return native.obstacle("fused")
     from .fused import nvrtc
 
     return nvrtc.obstacle()

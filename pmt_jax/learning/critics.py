@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .maths import running_moments
 from .maths.losses import value_loss
-from .optimise import fit
+from .optimise import Loss, fit
 from .rollout import flatten_steps
 from .schedules import Schedule
 from .setup import Setup
@@ -45,12 +45,19 @@ def fit_critic(
     moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
     normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
+    loss = loss_of(value_fn, clip)
+    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
+    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
+    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
+
+
+def loss_of(value_fn: ValueFn, clip: jax.Array | float) -> Loss:
+    """The mean of `value_loss` over rows of states, old values and targets, these in normalised units."""
+
     def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, old, target = minibatch
         return value_loss(value_fn(params, state), old, target, clip).mean(), {}
 
-    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
-    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
-    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
-    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
+    return loss

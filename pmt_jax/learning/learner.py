@@ -109,6 +109,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
 
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
+    setup = dataclasses.replace(setup, nets=setup.nets.fast)
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
     now = schedules.at(setup.config, hyper, state.update)

@@ -13,7 +13,7 @@ from .constraint import respond
 from .maths import distributions
 from .maths.advantages import standardise
 from .maths.losses import clipped_surrogate, hybrid_advantage
-from .optimise import fit
+from .optimise import Loss, fit
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_steps
@@ -170,20 +170,30 @@ def _clipped_epochs(
 ) -> tuple[TrainState, Metrics]:
     """Epochs of clipped policy gradient (PPO)."""
 
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
+    new, metrics = fit(net, clipped_loss(setup, hyper), samples, key, **limits, **passes)
+    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, samples)
+    return TrainState(params, new.opt_state), metrics
+
+
+def clipped_loss(setup: Setup, hyper: Hyper) -> Loss:
+    """What `_clipped_epochs` minimise, of one policy's weights and samples [R, ...]."""
+
     def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
         mean, std = setup.nets.policy(params, samples.obs)
         log_ratio = distributions.log_prob(samples.action, mean, std, samples.mask) - samples.log_prob
         gain = clipped_surrogate(log_ratio, samples.log_weight, samples.advantage, samples.factor, hyper.clip)
         entropy = distributions.entropy(std, samples.mask).mean()
         outside = jnp.abs(jnp.exp(log_ratio + samples.log_weight) - 1) > hyper.clip
-        deviation = (std * samples.mask).sum() / samples.mask.sum()
-        metrics = {"entropy": entropy, "clipped": outside.mean(), "std": deviation}
+        metrics = {
+            "entropy": entropy,
+            "clipped": outside.mean(),
+            "std": (std * samples.mask).sum() / samples.mask.sum(),
+        }
         return -gain.mean() - hyper.entropy_coef * entropy, metrics
 
-    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    new, metrics = fit(net, loss, samples, key, learning_rate=now.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
-    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, samples)
-    return TrainState(params, new.opt_state), metrics
+    return loss
 
 
 def _limit_kl(

@@ -20,7 +20,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, plain, records, render, runner
+from bench import compare, measure, once, plain, records, render, runner, update
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.tables import pages, runs, speed, values
@@ -631,3 +631,31 @@ def test_costs_through_an_episode_are_measured_of_policies_that_exist(monkeypatc
     episode_cost.main()
     assert len(asked) == 14 and set(asked) <= set(hub.names())  # of two tasks, seven methods each
     assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_kernels_of_a_loop_are_its_bodys_instructions_without_bookkeeping():
+    program = """
+%body.1 (p: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %p = (s32[], f32[4]) parameter(0)
+  %x = f32[4]{0} get-tuple-element(%p), index=1
+  %y = f32[4]{0} fusion(%x), kind=kLoop, calls=%inner
+  %start = ((f32[4]), f32[4]) copy-start(%y)
+  %done = f32[4]{0} copy-done(%start)
+  %z = f32[4]{0} custom-call(%done), custom_call_target="__cublas$gemm"
+  ROOT %t = (s32[], f32[4]) tuple(%i, %z)
+}
+
+ENTRY %main (a: f32[4]) -> f32[4] {
+  %w = (s32[], f32[4]) while(%init), condition=%cond.1, body=%body.1
+}
+"""
+    assert update.kernels(program) == 3
+    assert update.kernels("ENTRY %main (a: f32[4]) -> f32[4] {\n}\n") == 0
+
+
+@pytest.mark.full
+def test_a_gradient_step_is_timed_by_part():
+    for case in BENCHES["update"].quick:
+        row = update.update(case)
+        assert row["minibatch"] == 16 and row["step_seconds"] > 0
+        assert {"gather_seconds", "forward_seconds", "backward_seconds", "adam_seconds"} <= row.keys()
