@@ -151,7 +151,7 @@ def weights(setup: Setup, price: jax.Array) -> tuple[jax.Array | float, jax.Arra
     """What the reward [N] and each cost [N, K] count in the policies' loss, of what the costs' `price` [N, K] is.
 
     `pid`: 1 / (1 + lambda) and lambda / (1 + lambda), so that the step keeps its size however high the multiplier is
-    (Stooke et al., 2020, section 5). `switching`: 1 for the one that is improved. Else 1 and the price.
+    (Stooke et al., 2020, Algorithm 1). `switching`: 1 for the one that is improved. Else 1 and the price.
     """
     paid = price.sum(-1)
     if setup.method.constraint == "pid":

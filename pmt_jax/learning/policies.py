@@ -56,7 +56,8 @@ def policy_samples(
     """The batch as every agent's policy sees it, leaves [N, R, ...].
 
     Args:
-      price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of their own; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
+      price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of observations; cost_advantage:
+        [T, B, N, K]; log_weight: [T, B, N].
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)

@@ -23,9 +23,9 @@ def check(name: str) -> None:
     dataset = name.removeprefix(PREFIX)
     parse = optional("minari.dataset.minari_dataset", "minari").parse_dataset_id
     try:
-        namespace, _, version = parse(dataset)
+        version = parse(dataset)[2]
     except (ValueError, TypeError):  # the latter of a name without a version
-        namespace, version = None, None
+        version = None
     if version is None:
         raise UsageError(f"cannot write '{name}': a Minari data set is called like minari:lane/mappo_l-v0")
     if dataset in minari.list_local_datasets(latest_version=False):

@@ -74,7 +74,7 @@ def first_order_surrogate(
 
     Its gradient is that of the divergence from the best policy of a trust region without parameters, which is
     pi_old exp(A / tau) / Z (Zhang et al., 2020, Theorem 1 and Corollary 1, with tau their lambda). Rows whose policy
-    has already moved by more than `kl_limit` have no gradient (the indicator of section 4).
+    has already moved by more than `kl_limit` have no gradient (the indicator of their Algorithm 1).
 
     Args:
       log_ratio, log_weight, factor: [R], see `clipped_surrogate`; advantage: [R], A = A_r - sum_k nu_k A_c,k.
