@@ -37,8 +37,9 @@ def add(commands: Any) -> None:
         type=pathlib.Path,
         metavar="FILE.npz|minari:NAME-v0",
         help="also write every step of S seeds, E episodes, T steps and N agents, as a Minari data set or as arrays: "
-        "seed [S], length [S, E], obs [S, E, T, N, O], final_obs [S, E, N, O], action [S, E, T, N, A], reward [S, E, T]; cost and true_cost [S, E, T, N, K]; "
-        "terminated, truncated and info/NAME [S, E, T]; 0 after the end of an episode",
+        "seed [S], length [S, E], obs [S, E, T, N, O], final_obs [S, E, N, O], action [S, E, T, N, A], "
+        "reward [S, E, T]; cost and true_cost [S, E, T, N, K]; terminated, truncated and info/NAME [S, E, T]; "
+        "0 after the end of an episode",
     )
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from envs.toys import Lane
-from pmt_jax import METHODS, load_config, make_setup, make_train
+from pmt_jax import METHODS, load_config, make_train
 from pmt_jax.learning import fear, learner, policies, regret, schedules
 from pmt_jax.learning.types import LearnerState, Tag
 from small import SMALL, acted, differ, program, trained, weights
