@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from pmt_jax import load_config, make_setup
-from pmt_jax.learning import critics, fused, policies
+from pmt_jax.learning import critics, fused, policies, schedules
 from pmt_jax.learning.optimise import Loss, fit, init_train_state
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import Params, PolicySamples
@@ -139,7 +139,8 @@ def _actor(setup: Setup) -> Fit:
     full, zero = jnp.ones(wide), jnp.zeros(one)
     samples = PolicySamples(obs, action, full, zero, mean, full / 3, advantage, cost, zero, zero + 1)
     params = jax.tree.map(lambda x: x[0], setup.nets.init_actor(jax.random.key(2)))
-    return params, policies.clipped_loss(setup, setup.hyper), samples
+    now = schedules.at(setup.config, setup.hyper, jnp.int32(0))
+    return params, policies.policy_loss(setup, setup.hyper, now, samples, 0.0), samples
 
 
 # What a loop's body names besides what it launches.

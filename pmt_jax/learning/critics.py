@@ -18,9 +18,14 @@ from .types import Batch, Critic, Hyper, Metrics, Params
 ValueFn = Callable[[Params, jax.Array], jax.Array]
 
 
-def values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array, jax.Array]:
-    """Values of the states and of the true next states [T, B, ...], in the signal's unit."""
-    both = value_fn(critic.net.params, jnp.stack([batch.state, batch.next_state]))
+def inputs(batch: Batch) -> tuple[jax.Array, jax.Array]:
+    """What critics see and see next: states [T, B, S], or each agent's own observations [T, B, N, O] (IPPO)."""
+    return (batch.state, batch.next_state) if batch.next_obs is None else (batch.obs, batch.next_obs)
+
+
+def values(critic: Critic, value_fn: ValueFn, seen: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Values of what critics see and of what they see next [T, B, ...] (see `inputs`), in the signal's unit."""
+    both = value_fn(critic.net.params, jnp.stack(seen))
     value, next_value = running_moments.denormalise(critic.returns, both)
     return value, next_value
 
@@ -39,7 +44,8 @@ def fit_critic(
 
     Args:
       clip: half-width of the interval of values, in those units.
-      samples: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+      samples: what the critic sees, states [T, B, S] or observations [T, B, N, O]; values when they were collected and
+        returns, both [T, B, ...] in the signal's unit.
     """
     state, old_value, returns = samples
     moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)

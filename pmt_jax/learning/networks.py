@@ -11,6 +11,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from ..config.methods import Method
 from ..config.settings import Config
 from ..tasks import EnvSpec
 from . import fused
@@ -82,6 +83,7 @@ class Networks:
     Attributes:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
+      own_critics: critics see an agent's own observation [O], not the state [S]; all agents share one.
       fused: whether C++ code computes them where it can (see `fused`).
     """
 
@@ -90,6 +92,7 @@ class Networks:
     num_costs: int
     obs_dim: int
     state_dim: int
+    own_critics: bool
     actor: Actor
     critic: MLP
     cost_critic: MLP
@@ -118,11 +121,11 @@ class Networks:
 
     def init_critic(self, key: jax.Array) -> Params:
         """Weights of V."""
-        return self.critic.init(key, jnp.zeros(self.state_dim))
+        return self.critic.init(key, jnp.zeros(self.obs_dim if self.own_critics else self.state_dim))
 
     def init_cost_critic(self, key: jax.Array) -> Params:
-        """Weights of Vc, all heads [N, K] in one network."""
-        return self.cost_critic.init(key, jnp.zeros(self.state_dim))
+        """Weights of Vc, all heads in one network: [N, K], or [K] of an agent's own observation."""
+        return self.cost_critic.init(key, jnp.zeros(self.obs_dim if self.own_critics else self.state_dim))
 
     def init_fear(self, key: jax.Array, start: jax.Array | float) -> Params:
         """Weights of the fear prior network, all heads [N, K] in one, whose logits begin at about `start`.
@@ -191,13 +194,13 @@ class Networks:
         return {name: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])) for name, x in named.items()}
 
     def value(self, params: Params, state: jax.Array) -> jax.Array:
-        """V in normalised units: state [..., S] -> [...]."""
+        """V in normalised units: state [..., S] -> [...], or observations [..., N, O] -> [..., N]."""
         return self._apply(self.critic, params, state)[..., 0]
 
     def cost_value(self, params: Params, state: jax.Array) -> jax.Array:
-        """Vc in normalised units: state [..., S] -> [..., N, K]."""
+        """Vc in normalised units: state [..., S] or observations [..., N, O] -> [..., N, K]."""
         heads = self._apply(self.cost_critic, params, state)
-        return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
+        return heads if self.own_critics else heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
     def fear(self, params: Params, state: jax.Array) -> jax.Array:
         """Logits of the fear prior network: state [..., S] -> [..., N, K]."""
@@ -213,22 +216,24 @@ class Networks:
         return out
 
 
-def build(config: Config, spec: EnvSpec, share_actor: bool) -> Networks:
+def build(config: Config, spec: EnvSpec, method: Method) -> Networks:
     """The networks of a run."""
+    own_critics = method.critic == "observation"
 
     def mlp(outputs: int, head_gain: float) -> MLP:
         input_norm = config.obs_norm == "layernorm"
         return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
 
     return Networks(
-        num_actors=1 if share_actor else spec.num_agents,
+        num_actors=1 if method.share_actor else spec.num_agents,
         num_agents=spec.num_agents,
         num_costs=spec.num_costs,
         obs_dim=spec.obs_dim,
         state_dim=spec.state_dim,
+        own_critics=own_critics,
         actor=Actor(mlp(spec.action_dim, 0.01)),
         critic=mlp(1, 1.0),
-        cost_critic=mlp(spec.num_agents * spec.num_costs, 1.0),
+        cost_critic=mlp(spec.num_costs if own_critics else spec.num_agents * spec.num_costs, 1.0),
         fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
         regret_net=mlp(spec.action_dim, 0.01),
     )
