@@ -180,7 +180,12 @@ BENCHES = {
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
-        (*_walled("reference", physics="mujoco"), *_walled("solid", physics="mujoco")),
+        tuple(
+            case
+            for engine in ("fused", "mujoco")
+            for walls in ("reference", "solid")
+            for case in _walled(walls, physics=engine)
+        ),
         _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(
