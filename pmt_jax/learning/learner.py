@@ -130,8 +130,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.
-    held = state.constraint
-    horizon = setup.vector.horizon
+    held, horizon = state.constraint, setup.vector.horizon
     estimate = constraint.estimate_cost(
         setup.config.cost_estimate, horizon, batch, held.estimate, cost_value, hyper.gamma
     )
