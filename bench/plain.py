@@ -85,7 +85,7 @@ def _velocity(name: str) -> Task:
 
 
 def _multi_goal(variant: str) -> Task:
-    """Robots and as many vases as the engine's model has slots, anywhere on a grid; the forward pass is the sensors'."""
+    """Robots, and as many vases as the engine steps, anywhere on a grid; sensors need the forward pass."""
     name, number = GOALS[variant]
     kind, level = models.ROBOTS[name], LEVELS[number]
     vases = min(level.vases, 4)
