@@ -11,7 +11,7 @@ import json
 import pathlib
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
-from ..training import claims, trainer
+from ..training import claims, final, trainer
 from ..training.checkpoint import Checkpoints, Provenance
 from ..training.claims import claim
 from ..training.run_folder import Rescue, Say, load_saved
@@ -57,19 +57,34 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
     draws.json holds what was drawn at random.
     """
     with claim(out):
-        wanted = missing_programs(points, out, launch.say)
-        if values := drawn(parts, points):
-            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
-            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
-            with writing(out / "draws.json") as partial:
-                partial.write_text(json.dumps(values, indent=1) + "\n")
-        _check_missing(wanted)
+        wanted = prepare(parts, points, out, launch.say)
         code = train_programs(wanted, launch)
     if code == 0:
-        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        found = rows(read_all([out / name for name in points]), launch.say)
-        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
+        say_best(points, out, launch.say)
     return code
+
+
+def prepare(parts: Sequence[Part], points: Points, out: pathlib.Path, say: Say) -> list[Program]:
+    """What is missing of the `points` of `parts`, once it is known that it can be trained; writes draws.json.
+
+    Raises:
+      UsageError: as `train_points`.
+    """
+    wanted = missing_programs(points, out, say)
+    if values := drawn(parts, points):
+        seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
+        say(f"drawn with seed {seeds}: {out / 'draws.json'}")
+        with writing(out / "draws.json") as partial:
+            partial.write_text(json.dumps(values, indent=1) + "\n")
+    _check_missing(wanted)
+    return wanted
+
+
+def say_best(points: Points, out: pathlib.Path, say: Say) -> None:
+    """Prints the table of all points, which are finished."""
+    say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+    found = rows(read_all([out / name for name in points]), say)
+    say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
 
 
 def train_points(points: Points, out: pathlib.Path, launch: Launch = ONE_AT_A_TIME) -> int:
@@ -118,6 +133,16 @@ class Program:
     points: Points
     out: pathlib.Path
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether all its points have their folders."""
+        return all((self.out / name / "config.toml").is_file() for name in self.points)
+
+    @property
+    def number(self) -> int:
+        """That of its folder, from 1."""
+        return int(self.folder.name.split("-")[1])
+
     def title(self, number: int, count: int) -> str:
         """What is said of it, the `number`-th of `count`."""
         seeds = next(iter(self.points.values())).seeds
@@ -142,7 +167,7 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
     """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
     cache, say, count, at_once = launch
     for program in programs:
-        _write_points(program)
+        write_points(program)
     titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
     if at_once > 1:
         for title, program in titled:
@@ -160,7 +185,7 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
     return 0
 
 
-def _write_points(program: Program) -> None:
+def write_points(program: Program) -> None:
     try:
         (program.folder / "points").mkdir(parents=True, exist_ok=True)
         for name, config in program.points.items():
@@ -201,10 +226,22 @@ def _groups(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
 
 
 def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, count: int | None) -> int:
-    """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
-    group = program_folder.points(folder)
-    if not group:
-        raise UsageError(f"{folder} holds no points to train; it was deleted or replaced meanwhile")
+    """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`.
+
+    Raises:
+      InUse: another process trains them.
+      UsageError: the folder is gone.
+    """
+    with claim(folder):
+        group = program_folder.points(folder)
+        if not group:
+            raise UsageError(f"{folder} holds no points to train; it was deleted or replaced meanwhile")
+        return _train_group(folder, group, out, cache, say, count)
+
+
+def _train_group(
+    folder: pathlib.Path, group: Points, out: pathlib.Path, cache: bool, say: Say, count: int | None
+) -> int:
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])
     settings = [dataclasses.replace(setup, config=config).hyper for config in configs]
@@ -217,11 +254,8 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
     how = {"cache": cache, "say": say, "count": count, "warm_start": warm_start.prepare, "rescue": Rescue(out, files)}
-    with claim(folder):
-        code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
-        if code == 0:
-            code = _finish(folder, group, out, say)
-    return code
+    code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
+    return code or _finish(folder, group, out, say)
 
 
 def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) -> int:
@@ -233,10 +267,17 @@ def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) ->
     return 0
 
 
+def _of_point(rows: list[dict[str, Any]], config: Config, first: int, limits: dict[str, float]) -> list[dict[str, Any]]:
+    """The lines of evaluation.jsonl of a point whose trials begin with the `first`, as of a run of its own."""
+    own = [row for row in rows if row["seed"] in range(first, first + config.seeds)]
+    return [row | {"seed": config.seed + row["seed"] - first} | limits for row in own]
+
+
 def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
     rows = program_folder.rows(folder, group)
+    evaluation = final.read(folder / "run", step)
     for number, (name, config) in enumerate(group.items()):
         if (out / name / "config.toml").is_file():
             continue
@@ -248,6 +289,7 @@ def _cut(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         part.mkdir()
         (part / "config.toml").write_text(to_toml(config))
         (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in own))
+        final.write(part, _of_point(evaluation, config, first, limits.columns))
         shutil.copy(folder / "run" / "versions.json", part)
         checkpoints = Checkpoints(part)
         mine = jax.tree.map(lambda x: x[first : first + config.seeds], saved)  # noqa: B023
