@@ -46,8 +46,8 @@ def _broken(line: str, width: int) -> str:
     if "  " in prose:
         return line
     indent = " " * (len(line) - len(prose))
-    how = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.fill(prose, width, initial_indent=indent, subsequent_indent=f"{indent}  ", **how)
+    wrapper = textwrap.TextWrapper(width, indent, f"{indent}  ", break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(prose)
 
 
 def result(text: str) -> None:

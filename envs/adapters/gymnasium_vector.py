@@ -49,7 +49,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
         return {name: x for name, x in vars(self).items() if name not in ("_reset", "_step", "_vector")}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        vars(self).update(kept)
+        self.__dict__.update(kept)
         self._compile()
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
@@ -61,9 +61,9 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
         if "reset_mask" in (options or {}):
             raise TaskError("reset_mask cannot be had: episodes that end begin anew by themselves; reset without it")
         super().reset(seed=seed)
-        self._state = self._reset(key(self.np_random))
+        self._state = state = self._reset(key(self.np_random))
         self._waiting[:] = False
-        start = owned(self._state.env)
+        start = owned(state.env)
         return start.obs, {"global_state": start.global_state, "cost": start.cost, **start.info}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:

@@ -47,7 +47,7 @@ class PettingZooParallel(pettingzoo.ParallelEnv):
         return {name: x for name, x in vars(self).items() if name not in ("_reset", "_step", "_vector")}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        vars(self).update(kept)
+        self.__dict__.update(kept)
         self._compile()
 
     def observation_space(self, agent: str) -> Space:
@@ -64,8 +64,8 @@ class PettingZooParallel(pettingzoo.ParallelEnv):
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
-        self._state = self._reset(key(self._rng))
-        first = jax.tree.map(lambda x: x[0], owned(self._state.env))
+        self._state = state = self._reset(key(self._rng))
+        first = jax.tree.map(lambda x: x[0], owned(state.env))
         self._global_state = first.global_state
         return self._each(first.obs), self._infos(first.cost, first.info)
 

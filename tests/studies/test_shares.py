@@ -16,15 +16,16 @@ from pmt_jax.training.claims import claim
 from pmt_jax.training.loggers import Jsonl
 from runs import environment
 
-TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
+TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--minibatches", 1)
 TINY += ("--epochs", 1, "--method", "happo", "--steps", 400, "--no-cache")
-SWEEP = ("sweep", "lane", *TINY, "--set", "rollout_length=25,50,100", "--out")  # three programs of a point each
+SWEEP = ("sweep", "lane", *TINY, "--set", "hidden=[4],[6],[8]", "--out")  # three programs of a point each
 
 
 def finished(out: pathlib.Path) -> list[str]:
     return sorted(p.parent.name for p in out.glob("*/config.toml"))
 
 
+@pytest.mark.full
 def test_shares_train_their_own_programs_and_the_last_prints_the_table(tmp_path: pathlib.Path, cli):
     out = tmp_path / "out"
     code, text, err = cli(*SWEEP, out, "--part", "2/2")
@@ -46,6 +47,7 @@ def test_every_program_belongs_to_one_share():
         assert all(sum(share.has(program) for share in each) == 1 for program in programs)
 
 
+@pytest.mark.full
 def test_a_share_that_died_is_taken_up_by_the_next_call(tmp_path: pathlib.Path, cli, monkeypatch):
     """And a program that another process trains is left to it."""
     out = tmp_path / "out"

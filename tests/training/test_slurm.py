@@ -220,7 +220,8 @@ def test_the_pages_script_saves_requeues_and_survives_a_node(cluster: Cluster):
 
 def test_a_job_array_finishes_a_sweep(cluster: Cluster):
     out = cluster.top / "sweep"
-    words = f"pmt sweep {TINY} --method happo --steps 400 --set rollout_length=25,50 --out {out}"
+    training = TINY.replace("--hidden 8 ", "")
+    words = f"pmt sweep {training} --method happo --steps 400 --set 'hidden=[4],[8]' --out {out}"
     job = cluster.submit(f"#!/bin/bash\n#SBATCH --array=1-2 --ntasks=1\n{words}\n", "--output=array-%a.txt")
     until("both points", lambda: len(list(out.glob("*/config.toml"))) == 2)
     until("an end", lambda: not cluster.call("squeue", "-h", "-j", job))
