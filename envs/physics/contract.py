@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +43,19 @@ def check_versions() -> None:
 
 
 check_versions()
+
+
+class Remade:
+    """What is pickled as the arguments that it was made of, as it holds programs, threads or pointers."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        made = super().__new__(cls)
+        made._made_of = args, kwargs
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        args, kwargs = self._made_of
+        return functools.partial(type(self), *args, **kwargs), ()
 
 
 @jax.tree_util.register_dataclass

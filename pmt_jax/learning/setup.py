@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import numerics, tasks
-from ..config.methods import METHODS, Method
+from ..config.methods import Method, find
 from ..config.settings import HYPER_FIELDS, Config, Hyper
 from ..errors import UsageError
 from ..limits import Limits
@@ -117,7 +117,7 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     """
     if found := numerics.obstacle():
         raise UsageError(found)
-    method = METHODS[config.method]
+    method = find(config.method)
     if env is None:
         env = tasks.make(config.task, config.physics, **dict(config.env))
     else:
