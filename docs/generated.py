@@ -20,7 +20,8 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from pmt_jax import formats
+from bench.tables import pages
+from pmt_jax import formats, tasks
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.flags import describe
 from pmt_jax.config.fields import GROUPS
@@ -130,6 +131,15 @@ def _help(parser: argparse.ArgumentParser) -> str:
     return f"```text\n{parser.format_help().strip()}\n```"
 
 
+def all_tasks() -> str:
+    """What agents of every task observe, and the motors that they move."""
+    parts = ["# Tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
+    for name in tasks.names():
+        parts += [f"## {name} {{#{name}}}", "Observation:", pages.as_observation(name), "Actions:"]
+        parts += [pages.as_actions(name)]
+    return "\n\n".join(parts)
+
+
 def tutorial() -> str:
     """The notebook docs/tutorial.ipynb as a page."""
     cells = json.loads((DOCS / "tutorial.ipynb").read_text())["cells"]
@@ -154,6 +164,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "reference/settings.md": settings,
     "reference/metrics.md": metrics,
     "reference/commands.md": commands,
+    "reference/tasks.md": all_tasks,
     "design/contributing.md": from_the_top("CONTRIBUTING.md"),
     "palette.css": palette,
 }

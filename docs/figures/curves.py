@@ -28,22 +28,9 @@ FIGURES = {
     "table1_ant_4x2": "table1_ant_4x2_h200",
     "table2": "table2_h200",
     "table3_voltage_33": "table3_voltage_33_h200",
-    "table3_voltage_141": "table3_voltage_141_h200",
     "velocity_ant_2x4": "velocity_ant_2x4_h200",
-    "velocity_ant_4x2": "velocity_ant_4x2_h200",
-    "velocity_ant_2x4_limit_02": "velocity_ant_2x4_limit_02_h200",
     "velocity_half_cheetah_2x3": "velocity_half_cheetah_2x3_h200",
-    "velocity_half_cheetah_2x3_limit_02": "velocity_half_cheetah_2x3_limit_02_h200",
-    "velocity_fear_half_cheetah_2x3": "velocity_fear_half_cheetah_2x3_h200",
-    "velocity_half_cheetah_6x1": "velocity_half_cheetah_6x1_h200",
-    "velocity_hopper_3x1": "velocity_hopper_3x1_h200",
-    "velocity_humanoid_9_8": "velocity_humanoid_9_8_h200",
-    "velocity_swimmer_2x1": "velocity_swimmer_2x1_h200",
-    "velocity_walker2d_2x3": "velocity_walker2d_2x3_h200",
-    "ant_2x4_r4sg": "ant_2x4_r4sg",
-    "hand_over_training": "hand_over_training",
     "grid_33": "table3_voltage_33_h200",
-    "grid_141": "table3_voltage_141_h200",
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
 GRID_PANELS = {  # Fig. 3 of the paper
