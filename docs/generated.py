@@ -20,7 +20,8 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from bench.tables import pages
+from bench import records
+from bench.tables import pages, speed
 from pmt_jax import formats, tasks
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.flags import describe
@@ -132,12 +133,23 @@ def _help(parser: argparse.ArgumentParser) -> str:
 
 
 def all_tasks() -> str:
-    """What agents of every task observe, and the motors that they move."""
-    parts = ["# Tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
+    """What agents of every task observe, the motors that they move, and the options of the task."""
+    parts = ["# All tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
     for name in tasks.names():
-        parts += [f"## {name} {{#{name}}}", "Observation:", pages.as_observation(name), "Actions:"]
-        parts += [pages.as_actions(name)]
+        parts += [f"## {name} {{#{name}}}"]
+        shown = {"Observation": "observation", "Global state": "state", "Actions": "actions", "Options": "options"}
+        for title, kind in shown.items():
+            parts += [f"{title}:", pages.KINDS[kind](name)]
     return "\n\n".join(parts)
+
+
+def pretrained() -> str:
+    """The policies of the package with their evaluations, as `python -m bench publish` measured them."""
+    table = speed.TABLES["hub"](records.load())
+    head = (
+        "Reward and cost of mean actions; [use a pretrained policy](../howto/pretrained.md) says what the columns mean."
+    )
+    return f"# Pretrained policies\n\n{head}\n\n{table}\n"
 
 
 def tutorial() -> str:
@@ -165,6 +177,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "reference/metrics.md": metrics,
     "reference/commands.md": commands,
     "reference/tasks.md": all_tasks,
+    "reference/pretrained.md": pretrained,
     "design/contributing.md": from_the_top("CONTRIBUTING.md"),
     "palette.css": palette,
 }
