@@ -265,24 +265,25 @@ def test_kernels_are_ranked_by_the_time_of_all_their_launches():
     }
 
 
-def test_every_result_is_used_by_a_page_or_a_test():
+def test_pages_show_every_result():
+    """In a table, in a number of a sentence, in a picture, or in the generated page of pretrained policies."""
     pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"))]
-    shown = {name for text in pages for _, name, _, _ in render.BLOCK.findall(text)}
-    blocks = {name.partition(":")[2] or name for name in shown}
-    benches = {speed.TABLES[name].result for name in blocks if isinstance(speed.TABLES.get(name), speed.Table)}
-    elsewhere = {
-        "ant_paths",
-        "ant_paths_methods",
-        "episode_cost",
-        "fear_map",
-        "hand_over_catch",
-        *curves.FIGURES.values(),
-    }  # of pictures, and of a test
+    blocks = {name for text in pages for _, name, _, _ in render.BLOCK.findall(text)}
+    marks = {name for text in pages for _, name, _, _ in render.NUMBER.findall(text)}
+    shown = {file for name in blocks for file in (name.partition(":")[2] or name).split("+")}
+    shown |= {file for name in marks for file in name.split(":")[1].split("+")}
+    shown |= {"ant_paths_methods", "episode_cost", "fear_map", "hand_over_catch", "hub", *curves.FIGURES.values()}
+    benches = {speed.TABLES[name].result for name in shown if isinstance(speed.TABLES.get(name), speed.Table)}
     for file in records.RESULTS.glob("*.json"):
-        used = file.stem in blocks | elsewhere or any(
-            file.stem == name or file.stem.startswith(f"{name}_") for name in benches
-        )
+        used = file.stem in shown or any(file.stem == name or file.stem.startswith(f"{name}_") for name in benches)
         assert used, f"no page shows {file.name}"
+
+
+def test_the_tree_is_small():
+    """Results that pages show fit into 60 files and 10 MB, and what repeats them into 6 sweeps."""
+    results = list(records.RESULTS.iterdir())
+    assert {file.suffix for file in results} == {".json"}
+    assert len(results) <= 60 and sum(file.stat().st_size for file in results) <= 10e6 and len(SWEEPS) <= 6
 
 
 def test_rendering_replaces_blocks_and_nothing_else():
@@ -357,12 +358,11 @@ def stored() -> dict[str, list[runs.Run]]:
 
 
 GONE = {"lambda_rule", "cost_advantage", "fear_history", "regret_mask", "regret_target"}  # settings that runs have
-GONE_OF = {"velocity_entropy_h200": {"std_min"}}  # left the program after its trial (docs/appendix/velocity.md)
 
 
 @pytest.mark.parametrize("name", stored())
 def test_settings_of_stored_runs_have_their_present_names(name: str):
-    known = {*FIELDS, *GONE, *GONE_OF.get(name, ())}
+    known = {*FIELDS, *GONE}
     for run in stored()[name]:
         assert set(tomllib.loads(run.get("config", ""))) <= known
         named = re.findall(r"([\w.]+) ?= ?", run.get("label", ""))
