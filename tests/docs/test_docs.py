@@ -109,8 +109,8 @@ def test_the_version_is_in_one_place():
     assert "version" not in project["project"] and "version" in project["project"]["dynamic"]
     assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "pmt_jax.__version__"}
     assert not re.search(r"^version:", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
-    released, _, unreleased = re.search(r"^## ([\d.]+)( \((.*)\))?$", (ROOT / "CHANGELOG.md").read_text(), re.M).groups()
-    assert pmt_jax.__version__ == released + (".dev0" if unreleased == "unreleased" else "")
+    first = re.search(r"^## (\S+)( \(unreleased\))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert first and pmt_jax.__version__ == first[1] + (".dev0" if first[2] else "")
 
 
 def test_hooks_are_the_checks_of_ci():
