@@ -307,6 +307,7 @@ def test_rendering_fills_numbers_in_sentences():
     )
     both = "within:velocity_limit_5_h200+velocity_limit_02_h200:r4sg+macpo:5"
     assert values.number(both) == "17" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
+    assert values.number("seeds:velocity_h200:macpo:25:velocity_hopper_3x1") == "5"  # of one task in a file of eight
     for wrong, said in (
         (mark.format("7"), "no run of limits_macpo_recovery_h200 is 'macpo:7'"),
         ("withn:x:*:1", "unknown value 'withn'; did you mean 'within'?"),
@@ -507,7 +508,7 @@ def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
 
 
 def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
-    found = stored()["velocity_ant_2x4_h200"]
+    found = [run for run in stored()["velocity_h200"] if run["task"] == "velocity_ant_2x4"]
     one = next(run for run in found if run["method"] == "mixed")
     one["table"] = {column: [None, *scores[1:]] for column, scores in one["table"].items()}
     file = tmp_path / "broken.json"
