@@ -4,7 +4,7 @@ python -m bench list                           what is measured, and how long it
 python -m bench run                            everything, into bench/results; then the documentation's tables
 python -m bench run --quick                    does everything run? minutes, into a folder of its own
 python -m bench run ant grid                   some of it
-python -m bench peers --quick                  training against brax, JaxMARL, PyTorch and plain loops
+python -m bench peers --quick                  training compared with brax, JaxMARL, PyTorch and plain loops
 python -m bench compare HEAD~5 bench/results   results as files, folders or git revisions
 python -m bench render --check                 are the documentation's tables what bench/results says?
 python -m bench store RUN... -o FILE.json      training runs as a result for tables and pictures
@@ -54,9 +54,7 @@ def _add_measuring(commands: Any) -> None:
     one = command(commands, "measure", _measure, "run one bench in this process, as `run` does in another")
     one.add_argument("name", choices=BENCHES)
     one.add_argument("--out", type=pathlib.Path, required=True, help="a JSON file")
-    peers = command(
-        commands, "peers", _peers, "train against brax, JaxMARL, PyTorch and plain loops, for the same time"
-    )
+    peers = command(commands, "peers", _peers, "train for the same time as brax, JaxMARL, PyTorch and plain loops")
     peers.add_argument(
         "--out", type=pathlib.Path, help="a JSON file (default: in bench/results; with --quick a new one)"
     )

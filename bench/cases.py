@@ -11,7 +11,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.tasks import did_you_mean
 
 Timed = Literal["plain loop", "environment", "training", "power flow"]
-Kind = Timed | Literal["start", "checkpoint", "baseline", "certificate", "substep"]
+Kind = Timed | Literal["start", "checkpoint", "baseline", "certificate", "update"]
 Settings = tuple[tuple[str, Any], ...]
 
 
@@ -21,11 +21,10 @@ class Case:
 
     Attributes:
       kind: a plain Python loop over C MuJoCo; the environment alone under random actions; the whole training loop;
-        the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned; the kernels of an
-        integration step.
+        the start of `pmt train`; checkpoints; power flows; episodes of a policy that is not learned.
       task: an environment, or a network for power flows.
       what: which start, tool, policy, walls or rule.
-      method, physics, solver: of training and of the engine; the task's own if left out.
+      method, physics: of training and of the engine; the task's own if left out.
       seeds, num_envs: side by side; of power flows the batch, of a baseline or certificate its episodes.
       rollout_length: control steps of an environment between updates; alone, control steps in one call.
       devices: that share the environments and seeds; threads: plain loops at once, 0 for one on each of all CPUs.
@@ -38,7 +37,6 @@ class Case:
     what: str = ""
     method: str = ""
     physics: str = ""
-    solver: str = ""
     seeds: int = 1
     num_envs: int = 1
     rollout_length: int = 0
@@ -74,21 +72,26 @@ Build = Callable[[], Program]  # compiles
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """A list of cases, whose rows make one result.
+    """A list of cases, whose rows make one result. All programs are compiled first and take turns, so that other work
+    on the machine hits all alike.
 
     Attributes:
       what: what is measured, with units.
       cases: in the order of the rows; quick: what a smoke runs instead, once.
-      on: `gpu` and `gpus` are skipped if there is none, or only one, unless given by name; their results are
-        named after the device, too.
-      by_turns: all programs are compiled first and take turns, so that other work on the machine hits all alike.
+      on: `gpu` and `gpus` are skipped if there is none, or only one, unless given by name. `either` runs where it is
+        asked to. Results of GPUs are named after the device, too.
+      gpu: of a bench for `either`, its cases on a GPU.
     """
 
     what: str
     cases: Sequence[Case]
     quick: Sequence[Case]
-    on: Literal["cpu", "gpu", "gpus"] = "cpu"
-    by_turns: bool = True
+    on: Literal["cpu", "gpu", "gpus", "either"] = "cpu"
+    gpu: Sequence[Case] = ()
+
+    def chosen(self, on_cpu: bool, quick: bool) -> Sequence[Case]:
+        """The cases for a CPU or a GPU, or those of a smoke."""
+        return self.quick if quick else self.gpu if self.on == "either" and not on_cpu else self.cases
 
 
 def _alone(task: str, sizes: Iterable[int], steps: int = 0, seeds: int = 1, **engine: Any) -> tuple[Case, ...]:
@@ -108,18 +111,18 @@ def _training(task: str, method: str, seeds: int, num_envs: int, length: int, *m
     return Case("training", task, method=method, settings=more, **sizes, **engine)
 
 
-def _plain(task: str) -> tuple[Case, ...]:
-    return Case("plain loop", task, threads=1), Case("plain loop", task)
-
-
-def _ruled(task: str, *settings: tuple[str, Any]) -> tuple[Case, ...]:
-    pid = (("lambda_kp", 0.5), ("lambda_kd", 0.1))
-    rules = {"integral": (), "pid": pid}
-    return tuple(_training(task, "mappo_l", 1, 64, 64, *settings, *gains, what=rule) for rule, gains in rules.items())
+def _plain(task: str) -> Case:
+    return Case("plain loop", task)
 
 
 def _in_workers(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...]:
     return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), workers=count) for count in counts)
+
+
+def _fits(task: str, num_envs: int, length: int, *ways: str) -> tuple[Case, ...]:
+    """One step of the critic and of an actor, by XLA and by the learner's own code."""
+    sizes = {"method": "mappo_l", "num_envs": num_envs, "rollout_length": length}
+    return tuple(Case("update", task, f"{net} {way}", **sizes) for net in ("critic", "actor") for way in ways)
 
 
 def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tuple[Case, ...]:
@@ -147,34 +150,33 @@ ROBOTS = tuple(
 
 BENCHES = {
     "ant": Bench(
-        "ant: control steps/s per engine next to plain loops, alone and training; seconds to start; memory, GB",
+        "ant: control steps/s of the environment alone per engine and size, next to plain loops",
         (
-            *(Case("start", "ant_2x4", what, method="mappo_l") for what in ("empty cache", "second start")),
-            Case("start", "ant_2x4", "256 x 64", method="mappo_l", num_envs=256, rollout_length=64),
-            *_plain("ant_2x4"),
-            *_alone("ant_2x4", (16, 64, 256), physics="mujoco"),
-            *_alone("ant_2x4", (16, 64, 256), physics="mjx", solver="fast"),
-            *_alone("ant_2x4", (16, 64, 256), physics="mjx", solver="converged"),
-            *(_training("ant_2x4", "mappo_l", 1, n, 64, physics="mujoco") for n in (16, 64, 256)),
+            _plain("ant_2x4"),
+            *_alone("ant_2x4", (64, 256), physics="fused"),
+            *_alone("ant_2x4", (64, 256), physics="mujoco"),
+            *_alone("ant_2x4", (64,), physics="mjx"),
         ),
-        (
-            Case("start", "lane", "empty cache", method="mappo_l"),
-            *_plain("ant_2x4"),
-            *_alone("ant_2x4", (16,), physics="mujoco"),
-            _training("ant_2x4", "mappo_l", 1, 16, 64, physics="mujoco"),
+        (_plain("ant_2x4"), *_alone("ant_2x4", (16,), physics="mujoco")),
+        on="either",
+        gpu=(
+            *_alone("ant_2x4", (2048, 16_384), 100, physics="fused"),
+            *_alone("ant_2x4", (2048, 16_384), 100, physics="warp"),
+            *_alone("ant_2x4", (384,), 100, seeds=20, physics="fused"),
+            _plain("ant_2x4"),
         ),
     ),
     "workstation": Bench(
         "ant: control steps/s of plain loops, the environment and training, one seed, and 8 and 16 in worker processes",
         (
-            *_plain("ant_2x4")[1:],
+            _plain("ant_2x4"),
             *_alone("ant_2x4", (64, 256), physics="mujoco"),
             *(_training("ant_2x4", "mappo_l", 1, 256, 32, devices=count) for count in (1, 2, 4)),
             _training("ant_2x4", "mappo_l", 1, 64, 64),
             *_in_workers("ant_2x4", 8, (1, 2, 4, 8)),
             *_in_workers("ant_2x4", 16, (1, 4, 8, 16)),
         ),
-        (*_plain("ant_2x4")[1:], *_in_workers("ant_2x4", 2, (1, 2))),
+        (_plain("ant_2x4"), *_in_workers("ant_2x4", 2, (1, 2))),
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
@@ -184,24 +186,31 @@ BENCHES = {
     "hands": Bench(
         "hands: control steps/s per engine next to plain loops; CPU-seconds to compile",
         (
-            *_plain("hand_over_2x6"),
+            _plain("hand_over_2x6"),
             *_alone("hand_over_2x6", (64, 256), physics="mujoco"),
             *_alone("hand_over_2x6", (64, 256), physics="mjx"),
         ),
-        (*_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
+        (_plain("hand_over_2x6"), *_alone("hand_over_2x6", (64,), physics="mujoco")),
     ),
-    "velocity": Bench(
-        "velocity tasks: control steps/s of each robot per engine next to plain loops",
+    "robots": Bench(
+        "velocity tasks: control steps/s of each robot alone per engine, on a CPU next to plain loops",
         tuple(
             case
             for task in ROBOTS
             for case in (
-                *_plain(task),
-                *_alone(task, (64, 256), physics="mujoco"),
-                *_alone(task, (64,), physics="mjx"),
+                _plain(task),
+                *_alone(task, (256,), physics="fused"),
+                *_alone(task, (256,), physics="mujoco"),
             )
         ),
-        (*_plain("velocity_hopper_3x1"), *_alone("velocity_hopper_3x1", (64,), physics="mujoco")),
+        (_plain("velocity_hopper_3x1"), *_alone("velocity_hopper_3x1", (64,), physics="mujoco")),
+        on="either",
+        gpu=tuple(
+            case
+            for engine in ("fused", "warp")
+            for task in ROBOTS
+            for case in _alone(task, (16_384,), 50, physics=engine)
+        ),
     ),
     "methods": Bench(
         "every method: seconds to compile and per update, steps/s of the whole training loop",
@@ -211,10 +220,16 @@ BENCHES = {
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
     ),
-    "multiplier": Bench(
-        "the multiplier's rule: steps/s of the whole training loop with the integral and with PID",
-        (*_ruled("ant_2x4", *_BATCH), *_ruled("switch", *_LIKE_THE_ANT)),
-        _ruled("switch", *_LIKE_THE_ANT),
+    "update": Bench(
+        "one gradient step of a network: seconds by part, by XLA and by the learner's C++ code",
+        (*_fits("ant_2x4", 64, 64, "xla", "fused"), *_fits("ant_2x4", 256, 64, "xla", "fused")),
+        _fits("lane", 16, 16, "xla"),
+    ),
+    "update_gpu": Bench(
+        "GPU: one gradient step of a network: seconds and kernels by part",
+        (*_fits("ant_2x4", 2048, 8, "xla"), *_fits("ant_2x4", 384, 32, "xla")),
+        _fits("lane", 16, 16, "xla"),
+        on="gpu",
     ),
     "grid": Bench(
         "power flows/s next to other tools; environment steps/s in a scan and with a call a step",
@@ -249,64 +264,39 @@ BENCHES = {
         (Case("checkpoint", "lane", method="mixed", num_envs=16),),
     ),
     "start": Bench(
-        "GPU: seconds from `pmt train` to its first update, with empty caches and with those of the first start",
-        tuple(
+        "seconds from `pmt train ant_2x4` to its first update, with empty caches and with those of the first start",
+        tuple(Case("start", "ant_2x4", what, method="mappo_l") for what in ("empty cache", "second start")),
+        (Case("start", "lane", "empty cache", method="mappo_l"),),
+        on="either",
+        gpu=tuple(
             Case("start", "ant_2x4", what, method="mappo_l", num_envs=2048, rollout_length=8)
             for what in ("empty cache", "second start")
         ),
-        (Case("start", "lane", "empty cache", method="mappo_l"),),
-        on="gpu",
+    ),
+    "loop": Bench(
+        "ant: environment steps/s of the whole training loop per engine and size",
+        tuple(
+            _training("ant_2x4", "mappo_l", 1, n, 64, physics=engine)
+            for engine in ("fused", "mujoco")
+            for n in (64, 256)
+        ),
+        tuple(_training("switch", "mappo_l", seeds, 16, 25) for seeds in (1, 2)),
+        on="either",
+        gpu=(
+            _training("ant_2x4", "mappo_l", 1, 2048, 8, physics="fused"),
+            _training("ant_2x4", "mappo_l", 20, 384, 32, physics="fused"),
+            _training("ant_2x4", "mappo_l", 1, 2048, 8, physics="warp"),
+        ),
     ),
     "engines": Bench(
-        "GPU: environment steps/s per engine and size; seconds to compile",
+        "GPU: environment steps/s of hands and grids per engine and size",
         (
-            *_alone("ant_2x4", (1024, 4096, 16_384, 65_536), 100, physics="warp"),
-            *_alone("ant_2x4", (16_384,), 100, physics="warp", solver="fast"),
-            *_alone("ant_2x4", (1024, 2048), 100, seeds=5, physics="warp"),
-            *_alone("ant_2x4", (16_384,), 30, physics="mjx", solver="fast"),
-            *_alone("ant_2x4", (4096,), 20, physics="mjx"),
             *_alone("hand_over_2x6", (4096, 16_384), 100, physics="warp"),
-            *_alone("hand_over_2x6", (16_384,), 100, physics="warp", solver="fast"),
             *_alone("hand_over_2x6", (4096,), 20, physics="mjx"),
             *(case for task in ("voltage_33", "voltage_141") for case in _alone(task, (4096, 65_536), 240)),
         ),
         _alone("voltage_33", (64,), 60),
         on="gpu",
-        by_turns=False,
-    ),
-    "robots": Bench(
-        "GPU: velocity tasks: control steps/s of each robot alone; of training, five seeds",
-        tuple(
-            case
-            for task in ROBOTS
-            for case in (
-                *_alone(task, (2560, 16_384), 50, physics="warp"),
-                *(_training(task, "mappo_l", 5, *size) for size in ((512, 32), (2048, 8))),
-            )
-        ),
-        _alone("velocity_hopper_3x1", (64,), 4),
-        on="gpu",
-        by_turns=False,
-    ),
-    "substep": Bench(
-        "GPU: seconds of one integration step of the ant, solver iterations, and its slowest kernels",
-        tuple(Case("substep", "ant_2x4", num_envs=count) for count in (512, 2048, 16_384)),
-        (Case("substep", "ant_2x4", num_envs=64),),
-        on="gpu",
-    ),
-    "loop": Bench(
-        "GPU: environment steps/s of the whole training loop per method and size; memory, GB; share of time busy",
-        (
-            *(
-                _training("ant_2x4", "mappo_l", seeds, *size)
-                for size in ((128, 64), (384, 32), (512, 32), (2048, 8))
-                for seeds in (1, 5)
-            ),
-            *(_training("ant_2x4", method, 5, 2048, 8) for method in METHODS if method != "mappo_l"),
-        ),
-        tuple(_training("switch", "mappo_l", seeds, 16, 25) for seeds in (1, 2)),
-        on="gpu",
-        by_turns=False,
     ),
     "scaling": Bench(
         "GPUs: environment steps/s of the whole training loop over 1, 2, 4 ... devices, and the efficiency",

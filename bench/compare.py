@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 from .records import Record, Report
 
-LESS, SHARES = ("_seconds", "_gb", "_mb"), ("gpu_busy",)
+LESS = ("_seconds", "_gb", "_mb")
 # What says what a row is about, in the order in which it is said; everything else in a row was measured.
-SUBJECT = ("kind", "task", "name", "what", "method", "physics", "solver")
+SUBJECT = ("kind", "task", "name", "what", "method", "physics")
 SIZES = ("threads", "devices", "workers", "seeds", "num_envs", "rollout_length")
 WORSE = 0.9  # repeats scatter by about a tenth even on an idle machine
 
@@ -28,7 +28,7 @@ class Change(NamedTuple):
 
 
 def more_is_better(name: str) -> bool:
-    return name.endswith("_second") or name in SHARES
+    return name.endswith("_second")
 
 
 def label(row: Record) -> str:

@@ -8,12 +8,9 @@ notes how much of it went on.
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import dataclasses
 import itertools
-import os
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -23,47 +20,56 @@ import psutil
 
 import envs
 from envs.base import State
-from envs.physics import usable_cpus
+from envs.physics import obstacle, usable_cpus
 from envs.vector import restart
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training.compile import compile_run
 from pmt_jax.training.workers import start_workers
 
-from . import grid, once, plain, substep
-from .cases import Bench, Build, Case, Program
+from . import grid, once, plain, update
+from .cases import Build, Case, Program
+from .compare import label
 from .records import Record
 
 UPDATES = {"cpu": 1, "gpu": 8}  # of a call of the training loop
 
 
 class Effort(NamedTuple):
-    """How long to measure: turns of each program, seconds of a turn, seconds to wait for other work before each."""
+    """How long to measure: turns of each program, seconds of a turn, seconds to wait for other work before them."""
 
     turns: int
     seconds: float
     patience: float
 
 
-FULL, QUICK = Effort(7, 1.5, 20.0), Effort(2, 0.3, 0.0)
+# A lent GPU's host is never quiet, and other work on its cores hardly reaches the GPU: no turn waits for a pause there.
+FULL, ON_GPU, QUICK = Effort(5, 1.0, 60.0), Effort(5, 1.0, 0.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 
 
-def rows(bench: Bench, cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Record]:
-    """Measures cases; if one fails, its row says why."""
+def rows(cases: Sequence[Case], effort: Effort, say: Callable[[str], None]) -> Iterator[Record]:
+    """Measures cases; if one fails, its row says why. A case whose engine cannot run here has no row."""
     found, failed = {}, Failures()
+    cases = [case for case in cases if _can_run(case, say)]
     for case in [case for case in cases if case.kind in ONCE]:
-        await_quiet(6 * effort.patience if case.kind == "start" else 0)
+        await_quiet(effort.patience if case.kind == "start" else 0)
         found[case] = _attempt(failed, case, lambda case=case: ONCE[case.kind](case))
         yield _row(case, found, failed, say)
-    fits = [case for case in cases if case.devices <= jax.device_count() and case.workers <= max(2, usable_cpus())]
-    timed = [case for case in fits if case.kind not in ONCE]
-    for group in [timed] if bench.by_turns else [[case] for case in timed]:
-        programs = _compiled(group, failed, bench.on == "gpus", say)
-        turns = _take_turns(programs, effort)
-        found |= {case: program.facts | _medians(case, turns[case]) for case, program in programs.items()}
-        for case in group:
-            yield _row(case, found, failed, say)
+    timed = [case for case in cases if case.kind not in ONCE]
+    programs = _compiled(timed, failed, jax.default_backend() == "gpu", say)
+    turns = _take_turns(programs, effort)
+    found |= {case: program.facts | _medians(case, turns[case]) for case, program in programs.items()}
+    for case in timed:
+        yield _row(case, found, failed, say)
+
+
+def _can_run(case: Case, say: Callable[[str], None]) -> bool:
+    """Whether this machine has the devices, the CPUs and the engine; a missing engine is said."""
+    reason = obstacle(case.physics) if case.physics else None
+    if reason:
+        say(f"left out: {label(case.about())}: physics '{case.physics}' {reason}")
+    return reason is None and case.devices <= jax.device_count() and case.workers <= max(2, usable_cpus())
 
 
 def _row(case: Case, found: dict[Case, Record], failed: Failures, say: Callable[[str], None]) -> Record:
@@ -73,7 +79,7 @@ def _row(case: Case, found: dict[Case, Record], failed: Failures, say: Callable[
 
 
 def _attempt(failed: Failures, case: Case, work: Callable[[], Any]) -> Any:
-    """What `work` returns; an engine that is missing, or a device without the memory, is a result too."""
+    """What `work` returns; a task that cannot be made, or a device without the memory, is a result too."""
     try:
         return work()
     except Exception as error:
@@ -105,8 +111,8 @@ def _compiled(
 
 def environment(case: Case) -> Build:
     """jit(scan(vmap(step))) with random actions, and with resets if an episode terminates."""
-    named = {"physics": case.physics, "solver": case.solver}
-    env = envs.make(case.task, **{name: word for name, word in named.items() if word}, **dict(case.settings))
+    engine = {"physics": case.physics} if case.physics else {}
+    env = envs.make(case.task, **engine, **dict(case.settings))
     batch = case.seeds * case.num_envs
     step_all, reset_all = jax.vmap(env.step), jax.vmap(env.reset)
 
@@ -173,7 +179,7 @@ ONCE = {
     "checkpoint": once.checkpoint,
     "baseline": once.baseline,
     "certificate": once.certificate,
-    "substep": substep.substep,
+    "update": update.update,
 }
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 
@@ -183,37 +189,37 @@ MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": 
 
 
 class Turn(NamedTuple):
-    """Steps per second; CPUs that this process and others kept busy; a GPU's busy share, if there is one."""
+    """Steps per second; CPUs that this process and others kept busy."""
 
     rate: float
     cpu: float
     others: float
-    gpu: float | None
 
 
 def _take_turns(programs: dict[Case, Program], effort: Effort) -> dict[Case, list[Turn]]:
     """The turns of each program."""
     turns: dict[Case, list[Turn]] = {case: [] for case in programs}
+    patience = effort.patience
     for _ in range(effort.turns):
         for case, program in programs.items():
-            await_quiet(effort.patience)
+            begin = time.monotonic()
+            await_quiet(patience)
+            patience -= time.monotonic() - begin
             turns[case].append(_turn(program, effort.seconds))
     return turns
 
 
 def _turn(program: Program, seconds: float) -> Turn:
     watch, calls = Watch(), 0
-    with _busy() as busy:
-        while not calls or watch.wall < seconds:
-            program.call()
-            calls += 1
-        wall, others, own = watch.wall, watch.others, watch.own
-    return Turn(calls * program.steps / wall, own / wall, others, statistics.mean(busy) if busy else None)
+    while not calls or watch.wall < seconds:
+        program.call()
+        calls += 1
+    wall, others, own = watch.wall, watch.others, watch.own
+    return Turn(calls * program.steps / wall, own / wall, others)
 
 
 def _medians(case: Case, turns: Sequence[Turn]) -> Record:
     unit = "flows_per_second" if case.kind == "power flow" else "steps_per_second"
-    busy = [turn.gpu for turn in turns if turn.gpu is not None]
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")  # so far; a CPU has none
     return {
         unit: round(statistics.median(turn.rate for turn in turns), 1),
@@ -221,7 +227,6 @@ def _medians(case: Case, turns: Sequence[Turn]) -> Record:
         "steps_per_cpu_second": round(statistics.median(turn.rate / turn.cpu for turn in turns)),
         "other_work_cpus": round(statistics.median(turn.others for turn in turns), 2),
         **({"memory_gb": round(memory / 1e9, 2)} if memory else {}),
-        **({"gpu_busy": round(statistics.mean(busy), 2)} if busy else {}),
     }
 
 
@@ -262,18 +267,3 @@ def await_quiet(patience: float) -> None:
         time.sleep(0.3)
         if watch.others < 0.1:
             return
-
-
-@contextlib.contextmanager
-def _busy() -> Iterator[list[float]]:
-    """Yields a list that gets a GPU's utilisation, 0 to 1, every 100 ms; it stays empty without one."""
-    found: list[float] = []
-    if jax.devices()[0].platform != "gpu":
-        yield found
-        return
-    used = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]  # nvidia-smi counts all that the machine has
-    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits", "-i", used, "-lms", "100"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        yield found
-        process.terminate()
-        found += [float(line) / 100 for line in process.communicate()[0].splitlines() if line.strip().isdigit()]

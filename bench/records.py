@@ -41,7 +41,7 @@ def write(out: pathlib.Path, rows: Records, command: str) -> None:
 
 def conditions() -> dict[str, Any]:
     """Machine, device, versions, commit, date (UTC), load average, seconds this process took."""
-    changed = "+changes" if git("status", "--porcelain", "-uno") else ""
+    changed = "+changes" if git("status", "--porcelain", "-uno", "--", ":/", ":!results") else ""
     return {
         "machine": machine(),
         "device": jax.devices()[0].device_kind,

@@ -26,7 +26,7 @@ from .tables.speed import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
-NUMBER = re.compile(r"(<!-- bench: (\S+) -->)([^<\n]*)(<!-- /bench -->)")
+NUMBER = re.compile(r"(<!-- bench: (\S+) -->)([^<`\n]*)(<!-- /bench -->)")
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
 STORED = {**runs.KINDS, **study.KINDS}
 

@@ -43,7 +43,8 @@ def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: in
     done, failed, stopped = [], [], False
     for number, name in enumerate(benches, 1):
         bench = BENCHES[name]
-        result = name if bench.on == "cpu" else f"{name}_{slug(device)}"
+        on_cpu = bench.on == "cpu" or bench.on == "either" and device == "cpu"
+        result = name if on_cpu else f"{name}_{slug(device)}"
         if not names and (missing := _missing(bench, count, device)):
             say(f"[{number}/{len(benches)}] {name}: skipped, as there is {missing} here")
             continue
@@ -51,7 +52,7 @@ def run(names: Sequence[str], out: pathlib.Path | None, quick: bool, threads: in
         say(f"[{number}/{len(benches)}] {name}: {bench.what}{usual}")
         words = [name, "--threads", str(threads), "--only", only, *(["--quick"] if quick else [])]
         try:
-            ok = _child(words, bench.on == "cpu", out / f"{result}.json", say)
+            ok = _child(words, on_cpu, out / f"{result}.json", say)
         except KeyboardInterrupt:
             stopped = True
             break
@@ -76,13 +77,15 @@ def measure(name: str, out: pathlib.Path, quick: bool, threads: int, only: str, 
     from . import measure as measuring
 
     bench, rows = BENCHES[name], []
-    cases = [case for case in (bench.quick if quick else bench.cases) if _wanted(case.about(), only)]
+    on_cpu = bench.on == "cpu" or bench.on == "either" and jax.default_backend() == "cpu"
+    cases = [case for case in bench.chosen(on_cpu, quick) if _wanted(case.about(), only)]
     if bench.on == "cpu":  # before JAX starts
         processes.make_room(max((case.devices for case in cases), default=1))
+    effort = measuring.QUICK if quick else measuring.FULL if on_cpu else measuring.ON_GPU
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_default_matmul_precision", MATMUL_PRECISION)
     flags = " --quick" * quick + f" --threads {threads}" * bool(threads) + f" --only '{only}'" * bool(only)
-    for row in measuring.rows(bench, cases, measuring.QUICK if quick else measuring.FULL, say):
+    for row in measuring.rows(cases, effort, say):
         rows.append(row)
         records.write(out, rows, f"python -m bench run {name}{flags}")
 
@@ -111,8 +114,9 @@ def _child(words: Sequence[str], on_cpu: bool, result: pathlib.Path, say: Say) -
     """Runs one bench; its result takes the old one's place only when it is complete."""
     unfinished = result.with_name(f"{result.name}.unfinished")
     unfinished.unlink(missing_ok=True)
-    quiet = {"TF_CPP_MIN_LOG_LEVEL": "3"}  # XLA's complaints about programs it takes from the cache
-    environment = quiet | os.environ | ({"JAX_PLATFORMS": "cpu"} if on_cpu else {})
+    # XLA's complaints about programs it takes from the cache; a start needs memory of the GPU that this process has.
+    usual = {"TF_CPP_MIN_LOG_LEVEL": "3", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    environment = usual | os.environ | ({"JAX_PLATFORMS": "cpu"} if on_cpu else {})
     begin = time.monotonic()
     code = subprocess.run([*MEASURE, *words, "--out", str(unfinished)], env=environment, check=False).returncode
     took = f"{time.monotonic() - begin:.0f} s"
@@ -135,7 +139,7 @@ def last_results(say: Say) -> dict[str, records.Report]:
 
 def _missing(bench: Bench, count: int, device: str) -> str | None:
     """What `count` devices of this kind lack for a bench."""
-    if bench.on == "cpu":
+    if bench.on in ("cpu", "either"):
         return None
     return "no GPU" if device == "cpu" else "one GPU only" if bench.on == "gpus" and count == 1 else None
 

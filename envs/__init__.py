@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from . import ant, user, velocity, voltage
+from . import ant, multi_goal, user, velocity, voltage
 from .columns import Column
 from .errors import TaskError, did_you_mean
 
@@ -38,6 +38,10 @@ _TASKS = {
     "hand_over_4x3": _Task("hands.hand_over", "HandOver", {"variant": "4x3"}),
     "hand_over_safe_joint": _Task("hands.hand_over", "HandOver", {"variant": "safe_joint"}),
     "hand_over_safe_finger": _Task("hands.hand_over", "HandOver", {"variant": "safe_finger"}),
+    **{
+        f"multi_goal_{variant}": _Task("multi_goal.multi_goal", "MultiGoal", {"variant": variant}, multi_goal.COLUMNS)
+        for variant in multi_goal.VARIANTS
+    },
     "lane": _Task("toys", "Lane"),
     "switch": _Task("toys", "Switch"),
     "noisy": _Task("toys", "Noisy"),

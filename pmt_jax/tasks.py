@@ -39,6 +39,7 @@ __all__ = [
     "is_file",
     "make",
     "names",
+    "native",
     "options",
     "shares_cost",
     "task_file",
@@ -153,6 +154,11 @@ def advice(env: Env) -> str | None:
 def compiler() -> str:
     """What compiles the engine `fused` here; needs one."""
     return importlib.import_module(f"{_envs().__name__}.physics.fused_engine").compiler()
+
+
+def native() -> types.ModuleType:
+    """How C++ code is compiled and called here."""
+    return importlib.import_module(f"{_envs().__name__}.native")
 
 
 def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:

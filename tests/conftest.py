@@ -47,6 +47,17 @@ def state_of_the_user(tmp_path_factory: pytest.TempPathFactory):
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def cache_of_the_user():
+    """What is compiled for `fused` is kept where JAX's programs are: for all processes of the tests, and the next time.
+
+    Its key has all that it is made of, so nothing stale is found.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(CACHE.parent))
+        yield
+
+
 @pytest.fixture
 def cli(capsys: pytest.CaptureFixture[str]):
     """Runs a command line in this process: (exit code, stdout, stderr)."""

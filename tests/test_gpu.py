@@ -19,7 +19,7 @@ import scipy.stats
 
 import envs
 from envs import physics
-from envs.ant import corridor
+from envs.ant import corridor, walls
 from envs.physics import warp_engine
 from envs.physics.fused import gpu, threads
 from envs.physics.fused.model import tables
@@ -36,10 +36,17 @@ pytestmark = pytest.mark.gpu
 EPISODES = 1000
 
 
+def environment(task: str, engine: str):
+    """A task on an engine; skips the test where Warp is needed and missing."""
+    if engine == "warp":
+        pytest.importorskip("warp")
+    return envs.make(task, physics=engine)
+
+
 def test_warp_repeats_the_recorded_transitions():
     with np.load(DATA / "ant_reference_2x4.npz") as data:
         rows = dict(data)
-    env = envs.make("ant_2x4", physics="warp")
+    env = environment("ant_2x4", "warp")
     start = jax.vmap(env.restore)(rows["qpos0"], rows["qvel0"], rows["warm0"], rows["torso_xpos0"])
     after = jax.jit(jax.vmap(env.step))(start, rows["action"].reshape(-1, 2, 4).astype(np.float32))
     error = np.abs(np.asarray(after.carry.physics.qpos, np.float64) - rows["qpos1"]).max(axis=1)
@@ -84,10 +91,10 @@ def hands_on_c(out: str) -> None:
 
 
 def test_one_step_of_the_hands_is_that_of_c(tmp_path):
+    env = environment("hand_over_2x6", "warp")
     on_a_cpu(f"from test_gpu import hands_on_c; hands_on_c({str(tmp_path / 'c.npz')!r})").communicate()
     with np.load(tmp_path / "c.npz") as file:
         rows = dict(file)
-    env = envs.make("hand_over_2x6", physics="warp")
     start = jax.vmap(lambda raw: env.restore(**raw))({k[4:]: x for k, x in rows.items() if k.startswith("raw_")})
     after = jax.jit(jax.vmap(env.step))(start, rows["action"]).carry.physics.qpos
     error = np.abs(np.asarray(after) - rows["after"]).max(axis=1)
@@ -100,6 +107,7 @@ def test_one_step_of_the_hands_is_that_of_c(tmp_path):
     [("ant_2x4", "warp"), ("ant_2x4", "fused"), ("velocity_humanoid_9_8", "fused"), ("hand_over_2x6", "warp")],
 )
 def test_random_policy_earns_the_same_on_a_gpu_and_c(task, engine):
+    environment(task, engine)
     script = f"import json; from test_gpu import returns; print(json.dumps(returns({task!r}, 'mujoco')))"
     with on_a_cpu(script) as process:
         ours = returns(task, engine)
@@ -111,7 +119,7 @@ def test_random_policy_earns_the_same_on_a_gpu_and_c(task, engine):
 
 def ants(count: int) -> tuple[physics.PhysicsState, jax.Array]:
     """Ants on the ground and in the air."""
-    env = envs.make("ant_2x4", physics="warp")
+    env = environment("ant_2x4", "warp")
     start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), count)).carry.physics
     return start, jax.random.uniform(jax.random.key(1), (count, 8), minval=-1.0, maxval=1.0)
 
@@ -138,6 +146,8 @@ def test_lost_contacts_show(contacts, lost):
     ("engine", "module", "most"), [("warp", warp_engine, "_MOST_CONTACTS"), ("fused", threads, "MOST_SLOTS")]
 )
 def test_training_stops_where_contacts_were_lost(cli, tmp_path, monkeypatch, engine, module, most):
+    if engine == "warp":
+        pytest.importorskip("warp")
     monkeypatch.setattr(module, most, 1)
     settings = ["--physics", engine, "--num-envs", 64, "--rollout-length", 64, "--steps", 4096 * 4, "--no-cache"]
     code, out, _ = cli("train", "ant_2x4", "--out", tmp_path / "x", *settings)
@@ -203,10 +213,13 @@ READOUT = {name: (name, slice(None)) for name in ("xpos", "xquat", "cinert", "cv
 @functools.cache
 def robot(name: str) -> tuple:
     """Tables of a robot and 200 states [n, D] that random controls lead to: qpos, qvel, warm start, ctrl."""
-    model = corridor.model() if name == "corridor" else robots.model(name)
-    made_of = tables(model, corridor.SUBSTEPS if name == "corridor" else robots.ROBOTS[name].substeps, READOUT)
+    ant = {"corridor": corridor.model(), "walls": walls.model("solid")}.get(name)
+    model = ant or robots.model(name)
+    made_of = tables(model, corridor.SUBSTEPS if ant else robots.ROBOTS[name].substeps, READOUT)
     rng, count = np.random.default_rng(0), 200
     qpos = model.qpos0 + rng.uniform(-0.1, 0.1, (count, model.nq))
+    if name == "walls":
+        qpos[:, 1] += rng.choice([-4.3, 4.3], count)
     if made_of.has_free:
         qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     speed, still = 0.1 * rng.normal(size=(count, model.nv)), np.zeros((count, model.nv))
@@ -217,7 +230,7 @@ def robot(name: str) -> tuple:
     return made_of, (*states, jnp.asarray(ctrl[30], jnp.float32))
 
 
-every_robot = pytest.mark.parametrize("name", ["corridor", *robots.ROBOTS])
+every_robot = pytest.mark.parametrize("name", ["corridor", "walls", *robots.ROBOTS])
 
 
 def same(a, b) -> bool:

@@ -6,6 +6,7 @@ import ctypes
 import functools
 import hashlib
 import pathlib
+import platform
 import shutil
 import subprocess
 import tempfile
@@ -17,12 +18,14 @@ import pytest
 import envs.physics.fused
 from envs.physics.fused import threads
 from envs.physics.fused.model import Tables
+from paths import ROOT
 
 COMPILER = next((path for name in ("g++", "c++", "clang++") if (path := shutil.which(name))), None)
 compiled = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
 
 _SOURCE = pathlib.Path(__file__).with_suffix(".cpp")
 _FOLDER = pathlib.Path(str(envs.physics.fused.__file__)).parent
+_KEPT = ROOT / ".cache" / "threads"
 
 Rows = dict[str, np.ndarray]
 
@@ -47,12 +50,23 @@ def runner(tables: Tables, dtype: type[np.floating]) -> Callable[..., Rows]:
 
 @functools.cache
 def _built(source: str, dtype: str) -> ctypes.CDLL:
-    folder = pathlib.Path(tempfile.mkdtemp(prefix="threads_on_cpu_"))
-    model, library = folder / "tables.h", folder / f"{hashlib.sha256(source.encode()).hexdigest()[:12]}.so"
-    model.write_text(source)
+    """The library, kept for all processes of the tests and the next time, under a hash of all that it is made of."""
     real = {"float32": "float", "float64": "double"}[dtype]
-    flags = ["-O1", "-std=c++17", "-shared", "-fPIC", f"-DREAL={real}", f'-DMODEL="{model}"', f"-I{_FOLDER}"]
-    subprocess.run([str(COMPILER), *flags, "-o", str(library), str(_SOURCE)], check=True)
-    loaded = ctypes.CDLL(str(library))
-    shutil.rmtree(folder)
-    return loaded
+    flags = ["-O1", "-std=c++17", "-shared", "-fPIC", f"-DREAL={real}"]
+    headers = [path.read_bytes() for path in (_SOURCE, *sorted(_FOLDER.glob("*.h")))]
+    made_of = repr((source, headers, flags, _version(), platform.machine()))
+    library = _KEPT / f"{hashlib.sha256(made_of.encode()).hexdigest()[:20]}.so"
+    if not library.exists():
+        _KEPT.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=_KEPT) as folder:
+            model, part = pathlib.Path(folder) / "tables.h", pathlib.Path(folder) / "part.so"
+            model.write_text(source)
+            paths = [f'-DMODEL="{model}"', f"-I{_FOLDER}", "-o", str(part), str(_SOURCE)]
+            subprocess.run([str(COMPILER), *flags, *paths], check=True)
+            part.replace(library)
+    return ctypes.CDLL(str(library))
+
+
+@functools.cache
+def _version() -> str:
+    return subprocess.run([str(COMPILER), "--version"], check=True, capture_output=True, text=True).stdout

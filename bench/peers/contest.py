@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from .. import records, runner
+from .. import once, records, runner
 from ..records import Record
 from . import learners
 from .report import Report
@@ -21,7 +21,7 @@ from .report import Report
 Lines = list[dict[str, Any]]
 SIZES = ("num_envs", "rollout_length", "epochs", "minibatches")
 COMMAND = (sys.executable, "-m", "bench.peers")
-COMPILING = 600.0  # seconds that a turn may take besides its own
+COMPILING = 600.0  # seconds that a turn may take more than its own
 
 
 class Peer(NamedTuple):
@@ -48,7 +48,7 @@ class Effort(NamedTuple):
     elsewhere: float
 
 
-FULL, ON_GPU, QUICK = Effort(3, 60.0, 10.0), Effort(2, 15.0, 6.0), Effort(1, 10.0, 5.0)
+FULL, QUICK = Effort(1, 15.0, 8.0), Effort(1, 5.0, 3.0)
 _EACH = "2 actors, 2 critics of 128-128; cost"
 PEERS = {
     "plain": Peer("Python loops over C MuJoCo", f"{learners.TASK}, random actions", "none", learners.plain),
@@ -72,7 +72,7 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
       UsageError: figures of `quick` would replace the real ones.
     """
     _, device = runner.devices()
-    effort = QUICK if quick else FULL if device == "cpu" else ON_GPU
+    effort = QUICK if quick else FULL
     folder = runner.folder(out.parent if out else None, quick)
     out = out or folder / ("peers.json" if device == "cpu" else f"peers_{runner.slug(device)}.json")
     shape = (16, 16) if quick else (64, 64) if device == "cpu" else (2048, 8)
@@ -85,7 +85,7 @@ def run(out: pathlib.Path | None, quick: bool, jaxmarl: pathlib.Path | None, say
         for name, peer in PEERS.items():
             if turns[name] and "failed" in turns[name][-1]:
                 continue
-            for cache in ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH"):
+            for cache in ("JAX_COMPILATION_CACHE_DIR", *once.CACHES):
                 os.environ[cache] = str(pathlib.Path(caches.name) / name / cache)
             seconds = effort.seconds if peer.task == learners.TASK else effort.elsewhere
             turns[name].append(figures(_turn(name, seconds, turn, sizes, jaxmarl), seconds))

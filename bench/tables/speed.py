@@ -36,6 +36,11 @@ def where(report: Report) -> str:
     return textwrap.fill(", ".join(words) + ":", 120, break_on_hyphens=False)
 
 
+def of_bench(reports: Reports, bench: str) -> Reports:
+    """The results of a bench: that of a CPU has its name, those of GPUs the device's, too."""
+    return {name: report for name, report in reports.items() if name == bench or name.startswith(f"{bench}_")}
+
+
 def matching(rows: Records, **wanted: Any) -> Records:
     """Those of `rows` that have all these entries; None stands for one that is missing."""
     return [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
@@ -64,18 +69,6 @@ def _over(row: Record, rows: Records, **reference: Any) -> float | None:
     return statistics.median(ratios(row, found[0])) if found and rate(row) else None
 
 
-def _of_plain(row: Record, rows: Records) -> float | None:
-    ratio = _over(row, rows, kind="plain loop", task=row["task"], threads=1)
-    threads = max((other["threads"] for other in matching(rows, kind="plain loop")), default=1)
-    return ratio and ratio / threads
-
-
-def _of_plain_per_cpu(row: Record, rows: Records) -> float | None:
-    plain = matching(rows, kind="plain loop", task=row["task"], threads=1)
-    known = plain and "steps_per_cpu_second" in row and "steps_per_cpu_second" in plain[0]
-    return row["steps_per_cpu_second"] / plain[0]["steps_per_cpu_second"] if known else None
-
-
 def _of_plain_on_each_core(row: Record, rows: Records) -> float | None:
     """The rate over the steps that a plain loop makes in a CPU-second, on every core."""
     plain = max(matching(rows, kind="plain loop"), key=lambda loops: loops["threads"], default={})
@@ -83,22 +76,22 @@ def _of_plain_on_each_core(row: Record, rows: Records) -> float | None:
 
 
 def _of_as_many_loops(row: Record, rows: Records) -> float | None:
-    return _over(row, rows, kind="plain loop")
+    threads = max((loops["threads"] for loops in matching(rows, kind="plain loop", task=row["task"])), default=1)
+    return _over(row, rows, kind="plain loop", task=row["task"], threads=threads)
+
+
+_ONE_SEED = ("kind", "task", "method", "physics", "num_envs", "rollout_length")  # what a program of one seed shares
 
 
 def _times_one_seed(row: Record, rows: Records) -> float | None:
-    same = {name: row.get(name) for name in ("kind", "task", "method", "physics", "num_envs", "rollout_length")}
+    same = {name: row.get(name) for name in _ONE_SEED}
     ratio = _over(row, rows, **same, seeds=1) if row.get("seeds", 1) > 1 else None
     return ratio and row["seeds"] / ratio
 
 
 def _of_reference_walls(row: Record, rows: Records) -> float | None:
-    same = {name: row.get(name) for name in ("physics", "solver", "num_envs")}
+    same = {name: row.get(name) for name in ("physics", "num_envs")}
     return _over(row, rows, **same, what="reference")
-
-
-def _of_integral(row: Record, rows: Records) -> float | None:
-    return _over(row, rows, task=row["task"], what="integral")
 
 
 def _efficiency(row: Record, rows: Records) -> float | None:
@@ -150,7 +143,7 @@ def _shown(pattern: str, found: Figure | str) -> Callable[[Record, Records], str
 def _engine(row: Record, rows: Records) -> str:
     if row.get("physics", "xla") == "xla":
         return "plain C" if row["kind"] == "plain loop" else "plain JAX"
-    return f"`{row['physics']}`" + (f", `solver = {row['solver']}`" if row.get("solver") else "")
+    return f"`{row['physics']}`"
 
 
 def _contestant(row: Record, rows: Records) -> str:
@@ -164,22 +157,20 @@ def _rate_or_failure(row: Record, rows: Records) -> str:
 
 
 def _turns(name: str) -> Callable[[Record, Records], str]:
-    """The mean over turns of what stands in the row under that name, with the lowest and highest."""
+    """The mean over turns of what stands in the row under that name, with the lowest and highest of several."""
 
     def cell(row: Record, rows: Records) -> str:
         found = row.get(name)
-        return f"{statistics.mean(found):.2f} ({min(found):.2f} to {max(found):.2f})" if found else "-"
+        if not found:
+            return "-"
+        scatter = f" ({min(found):.2f} to {max(found):.2f})" if len(found) > 1 else ""
+        return f"{statistics.mean(found):.2f}{scatter}"
 
     return cell
 
 
 def _sizes(*names: str) -> Callable[[Record, Records], str]:
     return lambda row, rows: " x ".join(f"{row[name]:,}" for name in names if name in row) or "-"
-
-
-def _of_a_call_a_substep(row: Record, rows: Records) -> float | None:
-    same = {name: row.get(name) for name in ("kind", "task", "seeds", "num_envs")}
-    return _over(row, rows, what="a substep", **same)
 
 
 def _ours_cell(row: Record, rows: Records) -> str:
@@ -192,8 +183,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "program": _shown("{}", "name"),
     "physics": _shown("{}", "physics"),
     "environments x steps": _sizes("num_envs", "rollout_length"),
-    "epochs x minibatches": _sizes("epochs", "minibatches"),
-    "networks; cost": _shown("{}", "networks"),
     "of pmt train, MAPPO-L": _shown("{:.2f}", _of_mappo_l),
     "other work, CPUs": _shown("{:.1f}", "other_work_cpus"),
     "turns' reward": _turns("rewards"),
@@ -212,16 +201,12 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "steps in a call": _shown("{}", "rollout_length"),
     "environment steps/s": _rate_or_failure,
     "power flows/s": _rate_or_failure,
-    "of plain loop x threads": _shown("{:.2f}", _of_plain),
     "walls": _shown("{}", "what"),
     "of reference": _shown("{:.2f}", _of_reference_walls),
-    "rule": _shown("{}", "what"),
-    "of integral": _shown("{:.3f}", _of_integral),
-    "worker processes": _shown("{}", "workers"),
+    "worker processes": _shown("{}", "jobs"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
     "of plain loops at once": _shown("{:.2f}", _of_as_many_loops),
-    "the same per CPU-second": _shown("{:.2f}", _of_plain_per_cpu),
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
     "compile, s": _shown("{:.1f}", "compile_seconds"),
@@ -232,7 +217,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "x one seed": _shown("{:.2f}", _times_one_seed),
     "efficiency": _shown("{:.2f}", _efficiency),
     "memory, GB": _shown("{:.1f}", "memory_gb"),
-    "GPU busy": _shown("{:.0%}", "gpu_busy"),
     "compile cache": _shown("{}", "cache"),
     "kernels, s": _shown("{:.1f}", "kernel_seconds"),
     "first update, s": _shown("{:.1f}", "first_update_seconds"),
@@ -252,14 +236,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "save, s": _shown("{:.2f}", "save_seconds"),
     "load, s": _shown("{:.2f}", "load_seconds"),
     "share of wall time": _shown("{:.2%}", "overhead"),
-    "measured": _shown("{}", "kind"),
-    "a foreign call is": _shown("{}", "what"),
-    "of a call a substep": _shown("{:.2f}", _of_a_call_a_substep),
-    "substep, ms": _shown("{:.2f}", lambda row, rows: 1000 * row["substep_seconds"]),
-    "with one solver iteration, ms": _shown("{:.2f}", lambda row, rows: 1000 * row["one_iteration_seconds"]),
-    "launches": _shown("{}", "launches"),
-    "microseconds a launch": _shown("{:.1f}", lambda row, rows: 1e6 * row["substep_seconds"] / row["launches"]),
-    "solver iterations, mean and most": lambda row, rows: f"{row['iterations_mean']:.1f}, {row['iterations_most']}",
 }
 
 
@@ -272,20 +248,12 @@ class Table(NamedTuple):
 
     def __call__(self, reports: Reports) -> str:
         """Markdown, each table below a line that says where it was measured."""
-        found = [r for name, r in reports.items() if name == self.result or name.startswith(f"{self.result}_")]
+        found = of_bench(reports, self.result).values()
         return "\n\n".join(f"{where(report)}\n\n{self._of(report['rows'])}" for report in found) or NOT_YET
 
     def _of(self, rows: Records) -> str:
         shown = [row for row in rows if row["kind"] in self.kinds]
         return markdown(self.columns, ([COLUMNS[name](row, rows) for name in self.columns] for row in shown))
-
-
-def slowest(reports: Reports) -> str:
-    """The kernels of a substep that take longest, of the middle size, timed one by one."""
-    (report,) = (report for name, report in reports.items() if name.startswith("substep"))
-    row = sorted(report["rows"], key=lambda row: row["num_envs"])[len(report["rows"]) // 2]
-    body = [[f"`{name}`", str(count), f"{ms:.2f}"] for name, count, ms in row["slowest"]]
-    return markdown(("kernel", "launches a substep", f"milliseconds of all, {row['num_envs']:,} environments"), body)
 
 
 def hub(reports: Reports) -> str:
@@ -311,89 +279,146 @@ def hub(reports: Reports) -> str:
     return f"{markdown(head, body)}\n\n{len(rows)} policies, {total / 1000:.0f} kB in all."
 
 
+class Found(NamedTuple):
+    """A row, and the name of the result that it is of."""
+
+    result: str
+    row: Record
+
+
+def newest(reports: Reports, bench: str, gpu: bool, **wanted: Any) -> Found | None:
+    """The newest row with a rate that a bench measured on GPUs, or on CPUs, with all these entries."""
+    found = [
+        Found(name, row)
+        for name, report in of_bench(reports, bench).items()
+        if on_cpu(report) != gpu
+        for row in matching(report["rows"], **wanted)
+        if rate(row)
+    ]
+    return max(found, key=lambda x: (reports[x.result].get("date", ""), x.row.get("threads", 0)), default=None)
+
+
+def _pairs(reports: Reports) -> list[tuple[str, Found | None, str, Found | None]]:
+    """What is measured, its row, what one would use instead, and the row of that."""
+    ant = {"task": "ant_2x4", "kind": "environment", "seeds": 1}
+    large = {"num_envs": 256, "rollout_length": 64}, {"seeds": 1, "num_envs": 2048, "rollout_length": 8}
+    case = {"task": "case141", "num_envs": 1024}
+    return [
+        (
+            "ant, control steps, 256 at a time",
+            newest(reports, "ant", False, physics="fused", num_envs=256, **ant),
+            "plain Python loops over C MuJoCo, one a thread",
+            newest(reports, "ant", False, kind="plain loop"),
+        ),
+        (
+            "ant, control steps, 16,384 at a time",
+            newest(reports, "ant", True, physics="fused", num_envs=16_384, **ant),
+            "MuJoCo-Warp",
+            newest(reports, "ant", True, physics="warp", num_envs=16_384, **ant),
+        ),
+        (
+            "ant, steps of training, 256 x 64",
+            newest(reports, "loop", False, physics="fused", **large[0]),
+            "the same on MuJoCo's C engine",
+            newest(reports, "loop", False, physics="mujoco", **large[0]),
+        ),
+        (
+            "ant, steps of training, 2,048 x 8",
+            newest(reports, "loop", True, physics="fused", **large[1]),
+            "the same on MuJoCo-Warp",
+            newest(reports, "loop", True, physics="warp", **large[1]),
+        ),
+        (
+            "hands, control steps, 16,384 at a time",
+            newest(reports, "engines", True, task="hand_over_2x6", num_envs=16_384),
+            "",
+            None,
+        ),
+        (
+            "141 buses, power flows",
+            newest(reports, "grid", False, what="ours f32", **case),
+            "power-grid-model",
+            newest(reports, "grid", False, what="power-grid-model iterative_current", **case),
+        ),
+    ]
+
+
 def alternatives(reports: Reports) -> str:
-    """Speed in five rows, next to what one would use instead, and where and when each was measured."""
-    ant, engines, grid = (reports[name] for name in ("ant", "engines_h200", "grid"))
-    (plain,) = matching(ant["rows"], kind="plain loop", threads=2)
-    (alone,) = matching(ant["rows"], kind="environment", physics="mujoco", num_envs=256)
-    (training,) = matching(ant["rows"], kind="training", physics="mujoco", num_envs=64)
-    (gpu,) = matching(engines["rows"], task="ant_2x4", seeds=1, num_envs=16384, solver=None)
-    (hands,) = matching(engines["rows"], task="hand_over_2x6", num_envs=16384, solver=None)
-    case = {row["what"]: row for row in matching(grid["rows"], kind="power flow", task="case141", num_envs=1024)}
-    ours, theirs = case["ours f32"], case["power-grid-model iterative_current"]
-    cpu, h200 = f"{ant['machine']['cpu']}, 2 threads", f"1 {engines['device']}"
-    head = ("what", "machine", "here, per second", "instead", "per second")
-    lines = (
-        ("ant, control steps", cpu, alone, "plain Python loops over C MuJoCo", plain),
-        ("ant, control steps", h200, gpu, "the same loops on those 2 CPU threads", plain),
-        ("ant, steps of training", cpu, training, "", None),
-        ("hands, control steps", h200, hands, "", None),
-        ("141 buses, power flows", cpu, ours, "power-grid-model", theirs),
-    )
-    body = [(a, b, f"{rate(c):,.0f}", d, f"{rate(e):,.0f}" if e else "") for a, b, c, d, e in lines]
-    measured = {"Ant on a CPU": ant, "H200": engines, "buses": grid}
-    notes = [f"* {what}: {' '.join(where(report).split())[:-1]}." for what, report in measured.items()]
+    """Speed in a few rows, next to what one would use instead, and where and when each was measured."""
+    body, sources = [], dict[str, None]()
+    for what, ours, instead, theirs in _pairs(reports):
+        if ours is None:
+            continue
+        used = [found for found in (ours, theirs) if found]
+        sources |= dict.fromkeys(found.result for found in used)
+        figures = [f"{rate(found.row):,.0f}" for found in used]
+        ratio = f"{statistics.median(ratios(ours.row, theirs.row)):.1f}" if theirs else ""
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(found.result for found in used))
+        body.append([what, figures[0], instead, *(figures[1:] or [""]), ratio, names])
+    head = ("what", "here, per second", "instead", "per second", "ratio", "results")
+    notes = [f"* `{name}`: {' '.join(where(reports[name]).split())[:-1]}." for name in sources]
     return markdown(head, body) + "\n\n" + "\n".join(notes)
 
 
 def limits(reports: Reports) -> str:
-    """Training next to its environment alone, if both were measured at the same size."""
-    ant, engines, loop, scaling = (
-        reports[name]["rows"] for name in ("ant", "engines_h200", "loop_h200", "scaling_h200")
-    )
-    (cpu,), (cpu_alone,) = (
-        matching(ant, kind=kind, physics="mujoco", num_envs=256) for kind in ("training", "environment")
-    )
-    (five,) = matching(loop, method="mappo_l", seeds=5, num_envs=2048)
-    (five_alone,) = matching(engines, task="ant_2x4", seeds=5, num_envs=2048)
-    (one,) = matching(scaling, task="ant_2x4", what="one device")
-    (one_alone,) = matching(engines, task="ant_2x4", physics="warp", seeds=1, num_envs=4096)
+    """Training next to its environment alone, where both were measured at the same size on one kind of device."""
     body = []
-    for machine, row, alone in (
-        (f"{reports['ant']['machine']['cpu']}, 2 threads", cpu, cpu_alone),
-        (f"1 {reports['loop_h200']['device']}", one, one_alone),
-        (f"1 {reports['loop_h200']['device']}", five, five_alone),
-    ):
-        speeds = [row["steps_per_second"], alone["steps_per_second"]]
-        size = _sizes("seeds", "num_envs", "rollout_length")(row, [])
-        body.append([machine, size, *(f"{x:,.0f}" for x in speeds), f"{speeds[0] / speeds[1]:.2f}"])
+    for name, report in of_bench(reports, "loop").items():
+        machine = report["machine"]["cpu"] if on_cpu(report) else f"1 {report['device']}"
+        alike = [x for x in of_bench(reports, "ant").values() if x["device"] == report["device"]]
+        for row in report["rows"]:
+            same = {word: row.get(word) for word in ("physics", "seeds", "num_envs")}
+            found = [x for other in alike for x in matching(other["rows"], kind="environment", **same) if rate(x)]
+            if found and rate(row):
+                speeds = [row["steps_per_second"], found[0]["steps_per_second"]]
+                size = _sizes("seeds", "num_envs", "rollout_length")(row, [])
+                share = f"{speeds[0] / speeds[1]:.2f}"
+                body.append([machine, _engine(row, []), size, *(f"{x:,.0f}" for x in speeds), share, f"`{name}`"])
     head = (
         "machine",
+        "engine",
         SIZES,
         "training, steps/s",
         "environment alone, steps/s",
-        "share of the update that is environment",
+        "share of the update",
+        "result",
     )
     return markdown(head, body)
 
 
 def side_by_side(reports: Reports) -> str:
-    """Five seeds in one program on one GPU, next to one."""
-    rows = matching(reports["loop_h200"]["rows"], method="mappo_l")
+    """Seeds in one program on one GPU, next to one seed of the same size."""
     body = []
-    for one in matching(rows, seeds=1):
-        (five,) = matching(rows, seeds=5, num_envs=one["num_envs"], rollout_length=one["rollout_length"])
-        size = _sizes("num_envs", "rollout_length")(one, [])
-        body.append([size, _rate_or_failure(one, []), _rate_or_failure(five, []), f"{_times_one_seed(five, rows):.2f}"])
-    return markdown(
-        ("environments x steps", "one seed, steps/s", "five seeds, steps/s", "time of an update, x one seed"), body
+    for name, report in of_bench(reports, "loop").items():
+        for row in [row for row in report["rows"] if row["seeds"] > 1]:
+            if (times := _times_one_seed(row, report["rows"])) is not None:
+                one = matching(report["rows"], **{x: row[x] for x in _ONE_SEED}, seeds=1)[0]
+                size = _sizes("num_envs", "rollout_length")(one, [])
+                shown = [_rate_or_failure(x, []) for x in (one, row)]
+                body.append([size, _engine(row, []), str(row["seeds"]), *shown, f"{times:.2f}", f"`{name}`"])
+    head = (
+        "environments x steps",
+        "engine",
+        "seeds",
+        "one seed, steps/s",
+        "all seeds, steps/s",
+        "x one seed",
+        "result",
     )
+    return markdown(head, body)
 
 
-SPEED = ("", "engine", "environments", "environment steps/s", "of plain loop x threads")
-CPU_SECONDS = ("the same per CPU-second", "trace, CPU-s", "compile, CPU-s")
+SPEED = ("", "engine", "seeds x environments", "environment steps/s", "of plain loops at once")
+STARTS = ("what", "environments x steps", "compile cache", "kernels, s", "compile, s", "first update, s", "memory, GB")
 EVERY = ("plain loop", "environment", "training")
 SIZES = "seeds x environments x steps"
 TABLES: dict[str, Callable[[Reports], str]] = {
     "ant": Table("ant", EVERY, SPEED),
-    "starts": Table("ant", ("start",), ("what", "compile cache", "compile, s", "first update, s", "memory, GB")),
-    "gpu_starts": Table(
-        "start", ("start",), ("what", "compile cache", "kernels, s", "compile, s", "first update, s", "memory, GB")
-    ),
+    "start": Table("start", ("start",), STARTS),
     "walls": Table(
         "walls", ("environment",), ("walls", "engine", "environments", "environment steps/s", "of reference")
     ),
-    "hands": Table("hands", EVERY, (*SPEED, *CPU_SECONDS)),
+    "hands": Table("hands", EVERY, (*SPEED, "trace, CPU-s", "compile, CPU-s")),
     "workstation": Table(
         "workstation",
         EVERY,
@@ -412,13 +437,11 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         EVERY,
         ("", SIZES, "devices", "environment steps/s", "of plain loops at once", "rollout, s", "update, s"),
     ),
-    "velocity": Table("velocity", EVERY, ("task", *SPEED, CPU_SECONDS[0])),
     "methods": Table(
         "methods",
         ("training",),
         ("task", "method", "compile, s", "compile x MAPPO-L", "update, s", "update x MAPPO-L", "environment steps/s"),
     ),
-    "multiplier": Table("multiplier", ("training",), ("task", "rule", "environment steps/s", "of integral")),
     "power_flows": Table(
         "grid", ("power flow",), ("task", "batch", "what", "power flows/s", "ours f32 is faster by (lowest)")
     ),
@@ -440,28 +463,8 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "engines": Table(
         "engines", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s", "compile, s")
     ),
-    "robots": Table(
-        "robots", ("environment", "training"), ("task", "measured", SIZES, "environment steps/s", "compile, s")
-    ),
-    "substep": Table(
-        "substep",
-        ("substep",),
-        (
-            *("environments", "substep, ms", "with one solver iteration, ms", "solver iterations, mean and most"),
-            *("launches", "microseconds a launch"),
-        ),
-    ),
-    "slowest_kernels": slowest,
-    "foreign_calls": Table(
-        "foreign_calls",
-        ("environment", "training"),
-        ("task", "measured", "a foreign call is", SIZES, "environment steps/s", "of a call a substep", "compile, s"),
-    ),
-    "loop": Table(
-        "loop",
-        ("training",),
-        ("task", "method", "engine", SIZES, "environment steps/s", "update, s", "x one seed", "memory, GB", "GPU busy"),
-    ),
+    "robots": Table("robots", EVERY, ("task", *SPEED)),
+    "loop": Table("loop", ("training",), ("method", "engine", SIZES, "environment steps/s", "update, s", "x one seed")),
     "scaling": Table(
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
@@ -473,8 +476,8 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "peers",
         ("peer",),
         (
-            *("program", "task", "physics", "environments x steps", "epochs x minibatches", "networks; cost"),
-            *("environment steps/s", "of pmt train, MAPPO-L", "turns' reward", "turns' cost"),
+            *("program", "task", "physics", "environment steps/s", "of pmt train, MAPPO-L"),
+            *("turns' reward", "turns' cost"),
             *("first update, s", "other work, CPUs"),
         ),
     ),

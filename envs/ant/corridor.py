@@ -30,7 +30,7 @@ from ..blocks import Block, agent_index, joints, length, motors
 from ..errors import TaskError, one_of, typed
 from ..partition import evenly, parse
 from ..physics import PhysicsState, make_engine
-from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model, touching
+from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model
 
 SUBSTEPS = 5  # integration steps of 0.01 s in a control step
 CONTROL_DT = 0.05  # s
@@ -84,7 +84,6 @@ class AntCorridor:
         order is the one that the reference code effectively uses, not the one its partition table declares.
       partition: another division of the eight motors in place of `num_agents`, agents apart by `|`: `0,1,2,3,4,5|6,7`.
       physics: `auto`, `fused`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
-      solver: `converged`, or `fast` (fewer solver iterations, contacts of feet and torso only).
       observation: `zscore` (each vector standardised over its own entries, as the reference does) or `raw` (for
         learners that keep running moments).
       walls: `reference` (massless, so they do not block, and 1.8 m behind them nothing costs), `costly` (they do not
@@ -104,7 +103,6 @@ class AntCorridor:
         *,
         partition: str = "",
         physics: str = "auto",
-        solver: str = "converged",
         observation: str = "zscore",
         walls: str = "reference",
         sway: str = "none",
@@ -128,8 +126,6 @@ class AntCorridor:
                 "contact_force": ("cfrc_ext", slice(model().nbody)),  # of the ant; solid walls are bodies too
             },
             physics=physics,
-            solver=solver,
-            fast_contacts=touching(walls),
             threads=threads,
         )
         self.engine = self._engine.name

@@ -79,11 +79,6 @@ def _widen_bands(spec: mujoco.MjSpec) -> None:
         )
 
 
-def touching(walls: str) -> tuple[str, ...]:
-    """The geoms whose contacts are kept when the solver is fast: feet, torso, and what they touch."""
-    return ("floor", *TORSO_AND_FEET, *(_name("wall", *piece) for piece in _PIECES if walls == "solid"))
-
-
 def _name(kind: str, side: int, segment: int) -> str:
     return f"{kind}_{'left' if side > 0 else 'right'}_{segment + 1}"
 

@@ -168,7 +168,6 @@ class HandOver:
         but on `mjx`, where it takes twice the time and is 0.3 mm a step away from the other engines.
       full_hand: adds the 20 contacts inside each hand (fingers, thumb, palm) and the dry friction of its joints.
       physics: `auto`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
-      solver: `converged`, or `fast` (fewer solver iterations).
       threads: of the `mujoco` engine, which the devices of a process share; all usable CPUs if None.
     """
 
@@ -183,7 +182,6 @@ class HandOver:
         egg: str = "auto",
         full_hand: bool = False,
         physics: str = "auto",
-        solver: str = "converged",
         threads: int | None = None,
     ):
         num_agents, self._costly, self._free = VARIANTS[one_of("variant", variant, VARIANTS)]
@@ -201,7 +199,6 @@ class HandOver:
                 "sensors": ("sensordata", slice(None)),
             },
             physics=physics,
-            solver=solver,
             threads=threads,
         )
         self.engine = self._engine.name

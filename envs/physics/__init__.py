@@ -25,10 +25,9 @@ Examples:
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from ..errors import TaskError, one_of
+from ..errors import TaskError
 from .contract import (
     ENGINES,
     Engine,
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENGINES",
-    "SOLVERS",
     "Engine",
     "PhysicsState",
     "Readout",
@@ -60,17 +58,14 @@ __all__ = [
     "usable_cpus",
 ]
 
-SOLVERS = ("converged", "fast")
-
 
 def make_engine(
     model: mujoco.MjModel,
     *,
     substeps: int,
     readout: Readout,
+    forward: bool = False,
     physics: str = "auto",
-    solver: str = "converged",
-    fast_contacts: Collection[str] = (),
     threads: int | None = None,
     contacts: int | None = None,
 ) -> Engine:
@@ -78,29 +73,24 @@ def make_engine(
 
     Args:
       model: a compiled model; it is copied, never changed.
-      substeps: integration steps in a control step.
+      substeps: integration steps in a control step; 0, with `forward`, leaves the state as it is.
       readout: derived arrays to return, e.g. `{"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}`.
+      forward: a step ends with a forward pass at the new state under the same controls, and readouts are of that state,
+        not of the last substep.
       physics: `auto` or one of `ENGINES`; `auto` takes the fastest for the device (`engine.name` says which).
-      solver: `converged` keeps the model's solver settings; `fast` cuts Newton to 4 iterations of 8 line-search steps
-        and keeps only the contacts of `fast_contacts`: no difference in returns was found (KS p 0.58), one-step errors
-        grow to 1e-3.
-      fast_contacts: names of the geoms that keep their contacts when the solver is fast; empty keeps all.
       threads: of `fused` and `mujoco`; the process's usable CPUs if None.
       contacts: of `fused` and `warp`: room for so many contacts in a world; derived from the model if None.
 
     Raises:
-      TaskError: unknown engine or solver, or an engine that cannot run here, or not with this model.
+      TaskError: unknown engine, or one that cannot run here, or not with this model.
     """
-    one_of("solver", solver, SOLVERS)
-    chosen = resolve(physics, model, readout)
+    chosen = resolve(physics, model, readout, forward)
     if model.na or model.nmocap:
         raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
     model = copy.copy(model)
-    if solver == "fast":
-        _cut_solver(model, fast_contacts)
     # Each engine's module is imported when it is first built: warp needs packages that the others do without.
     if chosen == "fused":
-        from .fused.cpu import NoLibrary
+        from ..native import NoLibrary
         from .fused_engine import FusedEngine
 
         try:
@@ -108,22 +98,15 @@ def make_engine(
         except NoLibrary as error:
             if physics != "auto":
                 raise TaskError(f"physics 'fused' {error}") from error
-            chosen = resolve("auto", model, readout)
+            chosen = resolve("auto", model, readout, forward)
     if chosen == "mujoco":
         from .c_engine import CEngine
 
-        return CEngine(model, substeps, readout, threads)
+        return CEngine(model, substeps, readout, threads, forward)
     if chosen == "warp":
         from .warp_engine import WarpEngine
 
-        return WarpEngine(model, substeps, readout, contacts)
+        return WarpEngine(model, substeps, readout, contacts, forward)
     from .mjx_engine import MjxEngine
 
-    return MjxEngine(model, substeps, readout)
-
-
-def _cut_solver(model: mujoco.MjModel, keep: Collection[str]) -> None:
-    model.opt.iterations, model.opt.ls_iterations = 4, 8
-    for geom in range(model.ngeom):
-        if keep and model.geom(geom).name not in keep:
-            model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
+    return MjxEngine(model, substeps, readout, forward)

@@ -35,7 +35,9 @@ class CEngine:
 
     name = "mujoco"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None):
+    def __init__(
+        self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int | None, forward: bool = False
+    ):
         threads = usable_cpus() if threads is None else int(at_least("threads", threads, 1))
         _prepare_process()
         # A broken simulation must come out as it is: the vector wrapper counts and quarantines it.
@@ -43,6 +45,7 @@ class CEngine:
         if model.ntree == 1:  # one tree is one island; the search for it takes 6 % of a step and changes no bit
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self._model, self._substeps, self._readout, self._threads = model, substeps, dict(readout), threads
+        self._forward = forward
         views = after_step(mujoco.MjData(model), readout)
         ends = np.cumsum([view.size for view in views]).tolist()
         self._parts = [(slice(end - view.size, end), view.shape) for view, end in zip(views, ends, strict=True)]
@@ -54,7 +57,7 @@ class CEngine:
         """Made by the first step, as JAX has its devices by then. They call at the same time and share the threads."""
         runner = TeamSteps if needs_post_constraint(self._readout) else BatchSteps
         calls = jax.local_device_count() if jax.default_backend() == "cpu" else 1
-        return runner(self._model, self._substeps, self._readout, -(-self._threads // calls))
+        return runner(self._model, self._substeps, self._readout, -(-self._threads // calls), self._forward)
 
     def start(self) -> PhysicsState:
         return rest_state(self._model)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from .. import native
 from ..errors import TaskError, one_of
 from ..versions import installed_version
 
@@ -76,23 +77,25 @@ class Engine(Protocol):
 
         Returns:
           The new state and the readouts, which are what the integrator left behind: after RK4 they belong to its last
-          stage, not to the new qpos. Contact forces (`cfrc_ext`) include `mj_rnePostConstraint`. The
-          readout `overflow` is 1 if the step found no room for all contacts or constraints and is wrong, else 0: only
-          fused and warp have buffers that can be too small without raising.
+          stage, not to the new qpos, unless the engine was made with `forward`. Contact forces (`cfrc_ext`) include
+          `mj_rnePostConstraint`. The readout `overflow` is 1 if the step found no room for all contacts or constraints
+          and is wrong, else 0: only fused and warp have buffers that can be too small without raising.
         """
         ...
 
 
-def resolve(physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None) -> str:
-    """The engine that `physics` means on this machine, for a model and its readouts if they are given.
+def resolve(
+    physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None, forward: bool = False
+) -> str:
+    """The engine that `physics` means on this machine, for a model, its readouts and a forward pass if they are given.
 
     Raises:
       TaskError: no such engine, or it cannot run here, or not with this model.
     """
     one_of("physics", physics, ("auto", *ENGINES))
     if physics == "auto":
-        return next(name for name in _PREFERENCE if obstacle(name, model, readout) is None)
-    reason = obstacle(physics, model, readout)
+        return next(name for name in _PREFERENCE if obstacle(name, model, readout, forward) is None)
+    reason = obstacle(physics, model, readout, forward)
     if reason is not None:
         raise TaskError(f"physics '{physics}' {reason}")
     return physics
@@ -101,14 +104,17 @@ def resolve(physics: str, model: mujoco.MjModel | None = None, readout: Readout 
 _PREFERENCE = ("fused", "mujoco", "warp", "mjx")  # the first that can run: the next two never can on the same device
 
 
-def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None) -> str | None:
+def obstacle(
+    physics: str, model: mujoco.MjModel | None = None, readout: Readout | None = None, forward: bool = False
+) -> str | None:
     """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can.
 
-    Only `fused` depends on the model and its readouts. Without a model, the answer is about the machine alone.
+    Only `fused` depends on the model, its readouts and the forward pass. Without a model, the answer is about the
+    machine alone.
     """
     device = jax.devices()[0]
     if physics == "fused":
-        return _fused_obstacle(device, model, readout)
+        return _fused_obstacle(device, model, readout, forward)
     if physics == "mujoco" and device.platform != "cpu":
         return f"runs on CPUs only; found {device.device_kind} (set JAX_PLATFORMS=cpu, or take 'warp' or 'mjx')"
     if physics == "warp":
@@ -119,17 +125,19 @@ def obstacle(physics: str, model: mujoco.MjModel | None = None, readout: Readout
     return None
 
 
-def _fused_obstacle(device: jax.Device, model: mujoco.MjModel | None, readout: Readout | None) -> str | None:
+def _fused_obstacle(
+    device: jax.Device, model: mujoco.MjModel | None, readout: Readout | None, forward: bool
+) -> str | None:
     on_cpu = device.platform == "cpu"
     if not on_cpu and not _is_nvidia(device):
         return f"runs on CPUs and NVIDIA GPUs; found {device.device_kind} (take 'mjx')"
     reason = None if model is None else _refused(model, readout, on_cpu)
+    if forward and not reason:
+        reason = "cannot step this model: its step has no forward pass after the substeps"
     if reason:
         return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
     if on_cpu:
-        from .fused import cpu  # with its compilers, only if it is asked for
-
-        return cpu.obstacle()
+        return native.obstacle("fused")
     from .fused import nvrtc
 
     return nvrtc.obstacle()

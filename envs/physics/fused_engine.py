@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import native
 from ..errors import at_least
 from .batching import flattened
 from .contract import PhysicsState, Readout, rest_state, usable_cpus
@@ -76,4 +77,4 @@ class FusedEngine:
 
 def compiler() -> str:
     """What compiles the step for this process's devices."""
-    return cpu.describe() if jax.default_backend() == "cpu" else "compiled by NVRTC"
+    return native.describe() if jax.default_backend() == "cpu" else "compiled by NVRTC"

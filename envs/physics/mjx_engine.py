@@ -20,10 +20,10 @@ class MjxEngine:
 
     name = "mjx"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, forward: bool = False):
         mjx = import_mjx()
         check_hooks()
-        self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
+        self._c_model, self._substeps, self._readout, self._forward = model, substeps, dict(readout), forward
         with jax.ensure_compile_time_eval():  # constants, also where an environment is made inside a traced function
             self._model = mjx.put_model(model, impl="jax")
             self._data = mjx.make_data(model, impl="jax")
@@ -39,6 +39,8 @@ class MjxEngine:
         # TF32 on NVIDIA would cost three digits.
         with jax.default_matmul_precision("highest"), patched():
             data = jax.lax.fori_loop(0, self._substeps, lambda _, d: mjx.step(self._model, d), data)
+            if self._forward:
+                data = mjx.forward(self._model, data)
             if needs_post_constraint(self._readout):
                 data = smooth.rne_postconstraint(self._model, data)
         after, out = read_state(data, self._readout)

@@ -22,8 +22,9 @@ from .thread_team import LOST, NO_ROOM
 class BatchSteps:
     """Control steps of any number of environments, one `Batch` for each size of batch."""
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int):
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int, forward: bool = False):
         self._model, self._substeps, self._readout, self._threads = model, substeps, readout, threads
+        self._stage = int(mujoco.mjtStage.mjSTAGE_ACC if forward else mujoco.mjtStage.mjSTAGE_NONE)
         self.forget()
         _all.add(self)
 
@@ -41,7 +42,7 @@ class BatchSteps:
             batch = Batch(self._model, len(rows), min(self._threads, len(rows)))
             self.made.append(batch)
             simulations = _Simulations(batch, self._readout)
-        simulations.advance(rows, todo, out, self._substeps)
+        simulations.advance(rows, todo, out, self._substeps, self._stage)
         idle.append(simulations)
 
 
@@ -54,7 +55,7 @@ class _Simulations:
         self._inputs = [*state, batch.bind("ctrl")]
         self._outputs = [*state, *(batch.bind(field)[:, index] for field, index in readout.values())]
 
-    def advance(self, rows: np.ndarray, todo: np.ndarray, out: np.ndarray, substeps: int) -> None:
+    def advance(self, rows: np.ndarray, todo: np.ndarray, out: np.ndarray, substeps: int, stage: int) -> None:
         batch = self._batch
         batch.time[:] = 0.0
         batch.warning[..., 1] = 1  # C reports the first of each kind only
@@ -63,7 +64,10 @@ class _Simulations:
             end = start + view.shape[1]
             view[:] = rows[:, start:end]
             start = end
-        batch.step(todo, substeps)
+        if substeps:
+            batch.step(todo, substeps, stage)
+        else:
+            batch.forward(todo, stage)
         if (batch.warning[:, LOST, 1] > 1).any():
             raise MemoryError(NO_ROOM)
         done = slice(None) if len(todo) == len(rows) else todo

@@ -24,8 +24,9 @@ from .contract import Readout
 class TeamSteps:
     """Control steps of any number of environments, one mjData a thread."""
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int):
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int, forward: bool = False):
         self._model, self._substeps, self._readout, self._threads = model, substeps, readout, threads
+        self._forward = forward
         self._idle: list[_Worker] = []  # as many as ever worked at once
 
     def advance(self, rows: np.ndarray, todo: np.ndarray, out: np.ndarray) -> None:
@@ -38,7 +39,7 @@ class TeamSteps:
         try:
             worker = self._idle.pop()
         except IndexError:
-            worker = _Worker(self._model, self._substeps, self._readout)
+            worker = _Worker(self._model, self._substeps, self._readout, self._forward)
         for row in queue:
             worker.advance(states[row], out[row])
         worker.check_memory()
@@ -64,8 +65,8 @@ _PACKED = int(
 class _Worker:
     """One thread's mjData, with the array views that are read and written every control step."""
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout):
-        self._model, self._substeps = model, substeps
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, forward: bool):
+        self._model, self._substeps, self._forward = model, substeps, forward
         self._data = data = mujoco.MjData(model)
         self._warnings = data.warning
         for warning in data.warning:
@@ -78,6 +79,8 @@ class _Worker:
         data.time = 0.0
         mujoco.mj_setState(self._model, data, state, _PACKED)
         mujoco.mj_step(self._model, data, self._substeps)
+        if self._forward:
+            mujoco.mj_forward(self._model, data)
         mujoco.mj_rnePostConstraint(self._model, data)
         np.concatenate(self._outputs, out=out, casting="same_kind")
 

@@ -86,7 +86,6 @@ class Velocity:
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
         keep running moments).
       physics: `auto`, `fused`, `mujoco`, `mjx` or `warp`; see `envs.physics`.
-      solver: `converged`, or `fast` (fewer solver iterations).
       threads: of `fused` and `mujoco`, which the devices of a process share; all usable CPUs if None.
     """
 
@@ -103,7 +102,6 @@ class Velocity:
         fall_cost: bool = False,
         observation: str = "zscore",
         physics: str = "auto",
-        solver: str = "converged",
         threads: int | None = None,
     ):
         robot, benchmark_threshold, benchmark_partition = VARIANTS[one_of("variant", variant, VARIANTS)]
@@ -118,7 +116,7 @@ class Velocity:
         self._fall_cost = fall_cost
         partition = benchmark_partition if partition is None else _checked(partition, self.model.nu)
         self._agent, self._entry, mask = _motors(partition)
-        self._build_engine(physics, solver, threads)
+        self._build_engine(physics, threads)
         seen, names = (*joints(self.model, self.robot.unseen), *self._forces()), motors(self.model)
         self.declares = Declarations(
             observation=(*seen, agent_index(len(partition))),
@@ -140,7 +138,7 @@ class Velocity:
             cost_limit=(COST_LIMIT, FALL_LIMIT) if fall_cost else COST_LIMIT,
         )
 
-    def _build_engine(self, physics: str, solver: str, threads: int | None) -> None:
+    def _build_engine(self, physics: str, threads: int | None) -> None:
         place: Readout = {"torso_xpos": {"torso_xpos": ("xpos", 1)}, "com": {"com": ("subtree_com", 1)}}.get(
             self.robot.place, {}
         )
@@ -150,7 +148,6 @@ class Velocity:
             substeps=self.robot.substeps,
             readout=readout,
             physics=physics,
-            solver=solver,
             threads=threads,
         )
         self.engine = self._engine.name

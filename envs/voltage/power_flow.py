@@ -521,8 +521,7 @@ def branch_network(
     where = np.setdiff1d(np.arange(n_bus), [slack]) if inject is None else _injection_buses(inject, n_bus, slack)
     slack_v = slack_vm * np.exp(1j * slack_va)
     z_all, v_0 = _solved_for_voltage(y_bus, slack, slack_v, name)
-    series = to_series @ z_all[:, where]
-    series_0 = to_series @ v_0
+    series, series_0 = to_series @ z_all[:, where], to_series @ v_0
     feed, feed_0 = y_bus[slack] @ z_all[:, where], y_bus[slack] @ v_0
     lines = np.array([branch.is_line for branch in branches])
     plain = not half.any() and np.all(ratio == 1) and lines.all() and slack_v == 1 and not shunts.any()

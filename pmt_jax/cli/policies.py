@@ -35,10 +35,11 @@ def add(commands: Any) -> None:
     evaluation.add_argument(
         "--save",
         type=pathlib.Path,
-        metavar="FILE.npz",
-        help="also write every step of S seeds, E episodes, T steps and N agents: seed [S], length [S, E], "
-        "obs [S, E, T, N, O], action [S, E, T, N, A], reward [S, E, T]; cost and true_cost [S, E, T, N, K]; "
-        "terminated, truncated and info/NAME [S, E, T]; 0 after the end of an episode",
+        metavar="FILE.npz|minari:NAME-v0",
+        help="also write every step of S seeds, E episodes, T steps and N agents, as a Minari data set or as arrays: "
+        "seed [S], length [S, E], obs [S, E, T, N, O], final_obs [S, E, N, O], action [S, E, T, N, A], "
+        "reward [S, E, T]; cost and true_cost [S, E, T, N, K]; terminated, truncated and info/NAME [S, E, T]; "
+        "0 after the end of an episode",
     )
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 
@@ -51,6 +52,7 @@ def add(commands: Any) -> None:
     )
     export.add_argument("source", metavar="RUN", type=pathlib.Path, help=RUN)
     export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
+    export.add_argument("--onnx", action="store_true", help="also policy.onnx; needs pip install 'pmt-jax[onnx]'")
     add_seed(export)
     add_which(export)
     add_trust(export)
@@ -114,8 +116,9 @@ def run_export(arguments: argparse.Namespace) -> int:
         from ..trust import trusting
 
     with trusting(arguments.trust):
-        export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
-    say(f"wrote policy.stablehlo, policy.npz and numpy_policy.py into {arguments.out}")
+        chosen = (arguments.seed, arguments.which or "last")
+        *names, last = export_policy(arguments.source, arguments.out, *chosen, onnx=arguments.onnx)
+    say(f"wrote {', '.join(names)} and {last} into {arguments.out}")
     return 0
 
 

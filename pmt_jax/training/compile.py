@@ -119,7 +119,7 @@ def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     config = setup.config
     say(f"compiling {config.method} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
-    with compiling(_kernels(setup, say), say):
+    with compiling(_kernels(setup, say), say), tasks.announcing(say):
         state, programs, found = _compile_programs(setup, say)
         later = "; the first row compiles the checks of --debug" if setup.debug else ""
         say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found}){later}")

@@ -21,7 +21,7 @@ from .. import numerics
 from ..config.load import load_config, to_toml
 from ..errors import UsageError
 from ..files import read_rows, replace_text
-from ..learning import learner
+from ..learning import fused, learner
 from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
@@ -347,6 +347,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1, "workers": setup.workers}
+    found |= {"networks": "fused" if fused.available() else "xla"}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import multiprocessing
 import pathlib
@@ -19,7 +20,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, plain, records, render, runner, substep
+from bench import compare, measure, once, plain, records, render, runner, update
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.tables import pages, runs, speed, values
@@ -90,10 +91,11 @@ def test_ctrl_c_keeps_what_is_finished(fakes):
 def test_what_a_machine_lacks_is_skipped(
     fakes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int, device: str, skipped: list
 ):
-    out = fakes("first", "second", "third", second="gpu", third="gpus")
+    out = fakes("first", "second", "third", "fourth", second="either", third="gpu", fourth="gpus")
     monkeypatch.setattr(runner, "devices", lambda: (count, device))
     assert main(["run", "--out", str(out)]) == 0
-    names = ["first", "second_h200", "third_h200"][: 3 - len(skipped)]
+    second = "second" if device == "cpu" else "second_h200"  # what runs on either is named after the GPU
+    names = sorted(["first", second, *["third_h200", "fourth_h200"][: 2 - len(skipped)]])
     assert sorted(path.stem for path in out.iterdir()) == names
     said = capsys.readouterr().out
     assert [line.split("there is ")[1] for line in said.splitlines() if "skipped" in line] == [
@@ -163,12 +165,32 @@ def test_plain_loops_have_processes_that_end_with_their_program():
 
 def test_quick_and_only_choose_cases(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
     seen = []
-    monkeypatch.setattr(measure, "rows", lambda bench, cases, effort, say: seen.append((cases, effort)) or [])
+    monkeypatch.setattr(measure, "rows", lambda cases, effort, say: seen.append((cases, effort)) or [])
     monkeypatch.setattr("jax.config.update", lambda *_: None)
-    for quick, only in ((True, ""), (False, "training, num_envs 256")):
+    for quick, only in ((True, ""), (False, "environment, num_envs 256")):
         runner.measure("ant", tmp_path / "x.json", quick, threads=0, only=only, say=lambda _: None)
     assert seen[0] == (list(BENCHES["ant"].quick), measure.QUICK)
-    assert [(case.kind, case.num_envs) for case in seen[1][0]] == [("training", 256)]
+    assert [(case.physics, case.num_envs) for case in seen[1][0]] == [("fused", 256), ("mujoco", 256)]
+
+
+def test_a_gpu_has_cases_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path):
+    seen = []
+    monkeypatch.setattr(measure, "rows", lambda cases, effort, say: seen.append((cases, effort)) or [])
+    monkeypatch.setattr("jax.config.update", lambda *_: None)
+    for backend in ("cpu", "gpu"):
+        monkeypatch.setattr("jax.default_backend", lambda backend=backend: backend)
+        runner.measure("loop", tmp_path / "x.json", quick=False, threads=0, only="", say=lambda _: None)
+    assert seen == [(list(BENCHES["loop"].cases), measure.FULL), (list(BENCHES["loop"].gpu), measure.ON_GPU)]
+    assert {case.physics for case in BENCHES["loop"].gpu} == {"fused", "warp"}
+
+
+def test_an_engine_that_cannot_run_here_is_left_out_with_a_sentence(monkeypatch: pytest.MonkeyPatch):
+    """Not a failure: a machine without Warp measures the rest."""
+    monkeypatch.setitem(measure.MAKE, "environment", lambda case: lambda: measure.Program(lambda: None, 10))
+    said, cases = [], [Case("environment", "a", physics=engine, num_envs=5) for engine in ("warp", "mujoco")]
+    found = list(measure.rows(cases, measure.Effort(1, 0.0, 0.0), said.append))
+    assert [row["physics"] for row in found] == ["mujoco"]
+    assert said[0].startswith("left out: environment, a, warp, ") and "physics 'warp' needs an NVIDIA GPU" in said[0]
 
 
 @pytest.mark.full
@@ -218,8 +240,9 @@ def test_ratios_between_rows_are_taken_turn_by_turn():
         return {"kind": kind, "task": "x", "steps_per_second": float(np.median(rates)), "rates": rates, **more}
 
     loops = [row("plain loop", [100, 50, 100], threads=1), row("plain loop", [200, 100, 200], threads=2)]
+    elsewhere = row("plain loop", [1, 1, 1], threads=8) | {"task": "y"}
     alone = row("environment", [160, 90, 170], num_envs=8, physics="mujoco")  # the machine was busy in the second turn
-    shown = speed.COLUMNS["of plain loop x threads"](alone, [*loops, alone])
+    shown = speed.COLUMNS["of plain loops at once"](alone, [elsewhere, *loops, alone])
     assert shown == "0.85"  # the median of 0.8, 0.9 and 0.85
     one, five = ({"kind": "training", "task": "x", "seeds": n, "steps_per_second": 100.0 * n / 2} for n in (1, 5))
     assert speed.COLUMNS["x one seed"](five, [one, five]) == "1.00"
@@ -242,6 +265,23 @@ def test_a_table_for_each_device_and_a_failure_in_it():
     assert speed.TABLES["engines"]({}) == speed.NOT_YET
 
 
+def test_the_readme_compares_the_newest_rows_and_names_their_results():
+    row = {"kind": "environment", "task": "ant_2x4", "seeds": 1}
+    head, large = {"device": "NVIDIA H100", "versions": {"jax": "1"}, "commit": "abc"}, {"num_envs": 16_384}
+    reports = {
+        "ant_warp_h200": head
+        | {"date": "2026-01-01", "rows": [row | large | {"physics": "warp", "steps_per_second": 100.0}]},
+        "ant_h100": head
+        | {"date": "2026-03-01", "rows": [row | large | {"physics": "fused", "steps_per_second": 900.0}]},
+        "ant_h200": head
+        | {"date": "2026-02-01", "rows": [row | large | {"physics": "fused", "steps_per_second": 500.0}]},
+    }
+    said = speed.TABLES["alternatives"](reports)
+    assert "| 900 | MuJoCo-Warp | 100 | 9.0 | `ant_h100`, `ant_warp_h200` |" in said
+    assert "* `ant_h100`: 1 x NVIDIA H100, jax 1, commit abc, 2026-03-01." in said
+    assert len([line for line in said.splitlines() if line.startswith("|")]) == 3  # what was not measured has no line
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Pages
 
@@ -254,15 +294,6 @@ def reports() -> dict[str, records.Report]:
 @pytest.mark.parametrize("path", render.documents(), ids=lambda path: path.name)
 def test_documents_show_the_committed_results(path: pathlib.Path, reports: dict[str, records.Report]):
     assert render.render(path.read_text(), reports) == path.read_text(), "run python -m bench render"
-
-
-def test_kernels_are_ranked_by_the_time_of_all_their_launches():
-    launches = [("memset", 0.5), ("forward kernel _crb_073a11b8", 0.25), ("forward kernel _crb_073a11b8", 0.5)]
-    launches += [("forward kernel _search__locals__kernel_c6eeed5b", 0.125)]
-    assert substep.kernels(launches) == {
-        "launches": 4,
-        "slowest": [["_crb", 2, 0.75], ["memset", 1, 0.5], ["_search", 1, 0.125]],
-    }
 
 
 def test_pages_show_every_result():
@@ -288,12 +319,12 @@ def test_the_tree_is_small():
 
 def test_rendering_replaces_blocks_and_nothing_else():
     reports = records.load()
-    text = "before\n<!-- bench: starts -->\nold\n<!-- /bench -->\nafter\n"
+    text = "before\n<!-- bench: start -->\nold\n<!-- /bench -->\nafter\n"
     rendered = render.render(text, reports)
-    assert rendered.startswith("before\n<!-- bench: starts -->\n") and rendered.endswith("-->\nafter\n")
-    assert "| second start | hit |" in rendered
+    assert rendered.startswith("before\n<!-- bench: start -->\n") and rendered.endswith("-->\nafter\n")
+    assert "| second start | 2,048 x 8 | hit |" in rendered
     assert "old" not in rendered and render.render(rendered, reports) == rendered
-    for broken in ("<!-- bench: start -->\n<!-- /bench -->", "<!-- bench: starts -->\n"):
+    for broken in ("<!-- bench: starts -->\n<!-- /bench -->", "<!-- bench: start -->\n"):
         with pytest.raises(UsageError):
             render.render(broken, reports)
 
@@ -353,6 +384,7 @@ def test_the_readme_is_short_and_its_figures_are_made():
 # Stored runs
 
 
+@functools.cache  # nobody changes them
 def stored() -> dict[str, list[runs.Run]]:
     found = {file.stem: json.loads(file.read_text()) for file in sorted(records.RESULTS.glob("*.json"))}
     return {name: x for name, x in found.items() if isinstance(x, list) and "table" in x[0]}
@@ -594,3 +626,31 @@ def test_costs_through_an_episode_are_measured_of_policies_that_exist(monkeypatc
     episode_cost.main()
     assert len(asked) == 14 and set(asked) <= set(hub.names())  # of two tasks, seven methods each
     assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_kernels_of_a_loop_are_its_bodys_instructions_without_bookkeeping():
+    program = """
+%body.1 (p: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %p = (s32[], f32[4]) parameter(0)
+  %x = f32[4]{0} get-tuple-element(%p), index=1
+  %y = f32[4]{0} fusion(%x), kind=kLoop, calls=%inner
+  %start = ((f32[4]), f32[4]) copy-start(%y)
+  %done = f32[4]{0} copy-done(%start)
+  %z = f32[4]{0} custom-call(%done), custom_call_target="__cublas$gemm"
+  ROOT %t = (s32[], f32[4]) tuple(%i, %z)
+}
+
+ENTRY %main (a: f32[4]) -> f32[4] {
+  %w = (s32[], f32[4]) while(%init), condition=%cond.1, body=%body.1
+}
+"""
+    assert update.kernels(program) == 3
+    assert update.kernels("ENTRY %main (a: f32[4]) -> f32[4] {\n}\n") == 0
+
+
+@pytest.mark.full
+def test_a_gradient_step_is_timed_by_part():
+    for case in BENCHES["update"].quick:
+        row = update.update(case)
+        assert row["minibatch"] == 16 and row["step_seconds"] > 0
+        assert {"gather_seconds", "forward_seconds", "backward_seconds", "adam_seconds"} <= row.keys()

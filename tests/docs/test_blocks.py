@@ -28,7 +28,7 @@ from pmt_jax.studies import table
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- not run: \S.*? -->\n)?```(bash|python|toml)\n(.*?)```", re.DOTALL)
-SLOW = {"own_loop", "own_method", "voltage"}  # pages without shell blocks whose Python compiles for seconds
+SLOW = {"multi_goal", "own_loop", "own_method", "voltage"}  # pages without shell blocks that compile for seconds
 
 ELSEWHERE = {
     r"git clone|cd|python -m venv|source|pip install": "downloads; .ci/run makes environments and installs into them",

@@ -30,7 +30,13 @@ from pmt_jax.config.settings import FIELDS
 MARKDOWN = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [*sorted((ROOT / "pmt_jax").rglob("*.py")), *sorted((ROOT / "envs").rglob("*.py"))]
 # Examples that compile for several seconds; what they show is tested elsewhere too.
-SLOW = {"pmt_jax.learning.learner", "envs.voltage.control", "envs.voltage.baselines", "envs.voltage.power_flow"}
+SLOW = {
+    "pmt_jax.learning.learner",
+    "envs.multi_goal.multi_goal",
+    "envs.voltage.control",
+    "envs.voltage.baselines",
+    "envs.voltage.power_flow",
+}
 
 
 def pages(what: str) -> list[Any]:

@@ -16,12 +16,11 @@ from envs.blocks import length, slices
 from envs.voltage.control import load_scenario
 from paths import ROOT
 
+LATE = {"voltage_141", *(x for x in envs.names() if x.startswith("multi_goal_") and not x.endswith("point_1"))}
 NEEDS = {"plain": set(), "scene": {"qpos"}, "map": {"vm_pu"}}  # of the quantities that a picture reads
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.full] if x == "voltage_141" else []) for x in envs.names()]
-)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.full] if x in LATE else []) for x in envs.names()])
 def test_declarations_name_what_is_there(name):
     env = envs.make(name)
     state = jax.eval_shape(env.reset, jax.random.key(0))

@@ -19,7 +19,7 @@ from envs.voltage.control import VoltageControl
         ("lane", {"num_agents": True}, "num_agents must be a whole number, not True"),
         ("lane", {"num_agents": 0}, "num_agents must be at least 1, not 0"),
         ("ant_2x4", {"threads": "two"}, "threads must be a whole number or none, not 'two'"),
-        ("ant_2x4", {"solver": 3}, "solver must be a text, not 3"),
+        ("ant_2x4", {"walls": 3}, "walls must be a text, not 3"),
         ("hand_over_2x6", {"full_hand": 1}, "full_hand must be true or false, not 1"),
         ("voltage_33", {"v_lower": "abc"}, "v_lower must be a number, not 'abc'"),
         ("voltage_33", {"v_upper": float("nan")}, "v_upper must be a number, not nan"),

@@ -1,6 +1,7 @@
 // MuJoCo's formulae of contacts, constraints and fluid, which do not depend on the schedule.
 #pragma once
 #include "algebra.h"
+#include "boxes.h"
 
 // Segments are parallel where the square of the sine between them is below this, and centres are one below TINY (mjMINVAL).
 // MuJoCo 3.17 has 1e-8 and 1e-15; rounding in float makes as much of what is zero in double.

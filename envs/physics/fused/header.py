@@ -32,6 +32,7 @@ def header(tables: Tables) -> str:
             "SEGMENTS",
             ((s.body, s.place, s.half.any(), s.centre, s.half, s.side, s.radius) for s in t.segments),
         ),
+        _table("BlockRow", "BLOCKS", (_block(t, k) for k in range(len(t.blocks)))),
         _table("PairRow", "PAIRS", (_pair(t, pair) for pair in t.pairs)),
         _table("LimitRow", "LIMITS", t.limits),
         _table("MotorRow", "MOTORS", t.motors),
@@ -58,7 +59,10 @@ def _sizes(t: Tables) -> list[str]:
         "NBOXES": len(t.boxes),
         "NPOINTS": len(t.points),
         "NSEGMENTS": len(t.segments),
+        "NBLOCKS": len(t.blocks),
         "NPAIRS": len(t.pairs),
+        "NBLOCK_PAIRS": sum(pair.with_block for pair in t.pairs),
+        "ROOTED": t.rooted,
         "NLIMITS": len(t.limits),
         "NREADINGS": sum(len(reading.rows) for reading in t.readings.values()),
         "WIDTH": t.width,
@@ -122,9 +126,14 @@ def _place(place: Place) -> tuple[Any, ...]:
 
 
 def _pair(t: Tables, pair: Pair) -> tuple[Any, ...]:
-    segments = [t.segments[k] for k in (pair.first, pair.second)]
-    reach = pair.contact.margin + sum(s.radius + float(np.linalg.norm(s.half)) for s in segments)
-    return (pair.first, pair.second, len(pair.dofs), reach, pair.contact)
+    return (pair.first, pair.second, len(pair.dofs), pair.rooted, t.reach(pair), pair.contact)
+
+
+def _block(t: Tables, k: int) -> tuple[Any, ...]:
+    block = t.blocks[k]
+    own = [c for c, pair in enumerate(t.pairs) if pair.with_block and pair.first == k]
+    reach = block.reach if np.isfinite(block.reach) else 0.0
+    return (block.body, block.place, own[0], own[-1] + 1, block.axes, block.offset, block.size, reach)
 
 
 def _readings(t: Tables) -> Iterable[tuple[int, int]]:

@@ -2,15 +2,15 @@
 #pragma once
 #include "lanes_state.h"
 
-// Keeps a world's contacts within its room, and reports where it had too little.
-FUNCTION Mask admitted(Worlds& w, Mask has) {
-  if constexpr (MOST_CONTACTS < CANDIDATES) {
-    w.contacts += select(has, Num(1), Num(0));
-    const Mask over = has & (w.contacts > Num(MOST_CONTACTS));
-    w.overflow = select(over, Num(1), w.overflow);
-    return has & !over;
-  }
-  return has;
+// Keeps a world's contacts within its room, and reports where it had too little. Whether any world has the contact.
+FUNCTION bool admit(Worlds& w, Mask& has) {
+  if (!any(has)) return false;
+  if constexpr (MOST_CONTACTS >= CANDIDATES) return true;
+  w.contacts += select(has, Num(1), Num(0));
+  const Mask over = has & (w.contacts > Num(MOST_CONTACTS));
+  w.overflow = select(over, Num(1), w.overflow);
+  has &= !over;
+  return any(has);
 }
 
 FUNCTION Vec3 of_body(const Worlds& w, int b, const Real* place) {
@@ -69,8 +69,7 @@ FUNCTION void floor_contacts(Worlds& w) {
     const Num radius = Num(point.radius);
     const Num distance = dot(up, centre) + w.height - Num(point.height) - radius;
     Mask has = distance <= Num(point.contact.margin);
-    if (!any(has)) continue;
-    has = admitted(w, has);
+    if (!admit(w, has)) continue;
     const Vec3 first = point.capsule ? tangent(w.world, up, turned_with_body(w, b, point.axis)) : w.world.y;
     const Vec3 place = centre - up * (radius + Num(Real(.5)) * distance);
     const Frame frame = frame_of(place, up, first, point.contact.friction);
@@ -83,25 +82,13 @@ FUNCTION void floor_contacts(Worlds& w) {
   }
 }
 
-FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num second, Mask wanted) {
+FUNCTION void add_pair(Worlds& w, int c, Mask has, Num distance, Vec3 place, Vec3 normal, int place1, int place2) {
   const PairRow& pair = PAIRS[c];
-  const SegmentRow &one = SEGMENTS[pair.first], &two = SEGMENTS[pair.second];
-  const Vec3 on_first = s.middle1 + s.half1 * first, apart = s.middle2 + s.half2 * second - on_first;
-  const Num length = root(dot(apart, apart));
-  Num distance = length - Num(one.radius + two.radius);
-  Mask has = wanted & (distance <= Num(pair.contact.margin));
-  if (!any(has)) return;
-  has = admitted(w, has);
-  // A world without this contact must not see NaN: 0 * NaN would stay.
-  distance = select(has, distance, Num(0));
-  const Vec3 side1 = turned_with_body(w, one.body, one.side), side2 = turned_with_body(w, two.body, two.side);
-  const Vec3 normal = select(has, normal_between(w.world, apart, length, side1, side2), w.world.x);
-  const Vec3 surface = normal * (Num(one.radius) + Num(Real(.5)) * distance);
-  const Vec3 place = select(has, on_first + surface, vec(0, 0, 0));
   const Frame frame = frame_of(place, normal, tangent(w.world, normal), pair.contact.friction);
   Slot& slot = w.slots[w.slot_count++];
-  slot.dofs = PAIR_DOFS[c], slot.columns = pair.columns, slot.place1 = one.place, slot.place2 = two.place;
-  joint_columns(w, slot, frame, 0, PAIR_SIGNS[c]);
+  slot.dofs = PAIR_DOFS[c], slot.columns = pair.columns, slot.place1 = place1, slot.place2 = place2;
+  if (HAS_FREE && pair.rooted) root_columns(slot, frame);
+  joint_columns(w, slot, frame, pair.rooted ? FIRST : 0, PAIR_SIGNS[c]);
   if constexpr (READS_FORCES) slot.frame = frame;
   finish_slot(w, slot, has, distance, pair.contact);
   if constexpr (FILLS) {
@@ -111,13 +98,29 @@ FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num s
   }
 }
 
+FUNCTION void pair_contact(Worlds& w, int c, const Segments& s, Num first, Num second, Mask wanted) {
+  const PairRow& pair = PAIRS[c];
+  const SegmentRow &one = SEGMENTS[pair.first], &two = SEGMENTS[pair.second];
+  const Vec3 on_first = s.middle1 + s.half1 * first, apart = s.middle2 + s.half2 * second - on_first;
+  const Num length = root(dot(apart, apart));
+  Num distance = length - Num(one.radius + two.radius);
+  Mask has = wanted & (distance <= Num(pair.contact.margin));
+  if (!admit(w, has)) return;
+  // A world without this contact must not see NaN: 0 * NaN would stay.
+  distance = select(has, distance, Num(0));
+  const Vec3 side1 = turned_with_body(w, one.body, one.side), side2 = turned_with_body(w, two.body, two.side);
+  const Vec3 normal = select(has, normal_between(w.world, apart, length, side1, side2), w.world.x);
+  const Vec3 surface = normal * (Num(one.radius) + Num(Real(.5)) * distance);
+  add_pair(w, c, has, distance, select(has, on_first + surface, vec(0, 0, 0)), normal, one.place, two.place);
+}
+
 FUNCTION void pair_contacts(Worlds& w) {
   Vec3 middles[at_least_one(NSEGMENTS)], halves[at_least_one(NSEGMENTS)];
   for (int g = 0; g < NSEGMENTS; ++g) {
     middles[g] = of_body(w, SEGMENTS[g].body, SEGMENTS[g].centre);
     halves[g] = turned_with_body(w, SEGMENTS[g].body, SEGMENTS[g].half);
   }
-  for (int c = 0; c < NPAIRS; ++c) {
+  for (int c = 0; c < NSEGMENT_PAIRS; ++c) {
     const PairRow& pair = PAIRS[c];
     const int one = pair.first, two = pair.second;
     const Vec3 apart = middles[one] - middles[two];
@@ -129,6 +132,63 @@ FUNCTION void pair_contacts(Worlds& w) {
     else if (SEGMENTS[two].capsule) nearest = nearest_of_sphere_and_capsule(s);
     pair_contact(w, c, s, nearest.first, nearest.second, mask_of(true));
     if (any(nearest.two)) pair_contact(w, c, s, nearest.first_again, nearest.second_again, nearest.two);
+  }
+}
+
+// A block as the base's frame has it: a point of that frame is at axes * point + shift of the block's.
+struct BlockFrame {
+  Mat3 axes;  // rows are the block's axes
+  Vec3 shift;
+};
+
+FUNCTION BlockFrame frame_of(const Worlds& w, const BlockRow& block) {
+  const Mat3 own = mat(block.axes);
+  const Vec3 offset = vec(block.offset);
+  if (block.body < 0) {  // fixed to the world, in which the root is; a place far from the origin keeps its digits
+    return {own * w.attitude, own * vec(w.qpos[0], w.qpos[1], w.qpos[2]) - offset};
+  }
+  if (block.body == 0) return {own, -offset};
+  const Mat3& turn = w.turn[block.body];
+  const Mat3 axes = {turn * own.r0, turn * own.r1, turn * own.r2};
+  return {axes, -(axes * w.place[block.body]) - offset};
+}
+
+FUNCTION void block_contact(Worlds& w, int c, const BlockRow& block, const BlockFrame& in, Vec3 place, Mask wanted) {
+  const PairRow& pair = PAIRS[c];
+  const SegmentRow& segment = SEGMENTS[pair.second];
+  const Vec3 inside = in.axes * place + in.shift;
+  const Num centre[3] = {inside.x, inside.y, inside.z};
+  Num out[3];
+  Num distance = sphere_on_box(centre, Num(segment.radius), block.size, out);
+  Mask has = wanted & (distance <= Num(pair.contact.margin));
+  if (!admit(w, has)) return;
+  distance = select(has, distance, Num(0));
+  const Vec3 normal = select(has, transposed_times(in.axes, vec(out[0], out[1], out[2])), w.world.x);
+  const Vec3 surface = normal * (Num(segment.radius) + Num(Real(.5)) * distance);
+  add_pair(w, c, has, distance, select(has, place - surface, vec(0, 0, 0)), normal, block.place, segment.place);
+}
+
+FUNCTION void block_pair(Worlds& w, int c, const BlockRow& block, const BlockFrame& in) {
+  const SegmentRow& segment = SEGMENTS[PAIRS[c].second];
+  const Vec3 place = of_body(w, segment.body, segment.centre), inside = in.axes * place + in.shift;
+  const Num middle[3] = {inside.x, inside.y, inside.z};
+  const Mask near = square_outside(middle, block.size) <= Num(PAIRS[c].reach * PAIRS[c].reach * Real(1.0001));
+  if (!any(near)) return;
+  if (!segment.capsule) return block_contact(w, c, block, in, place, near);
+  const Vec3 axis = turned_with_body(w, segment.body, segment.half), inside_axis = in.axes * axis;
+  const Num half[3] = {inside_axis.x, inside_axis.y, inside_axis.z};
+  const Spheres spheres = spheres_on_box(middle, half, block.size);
+  block_contact(w, c, block, in, place + axis * spheres.first, near);
+  if (any(near & spheres.two)) block_contact(w, c, block, in, place + axis * spheres.second, near & spheres.two);
+}
+
+FUNCTION void block_contacts(Worlds& w) {
+  for (int k = 0; k < NBLOCKS; ++k) {
+    const BlockRow& block = BLOCKS[k];
+    const BlockFrame in = frame_of(w, block);
+    const Num base[3] = {in.shift.x, in.shift.y, in.shift.z};
+    if (block.reach > 0 && !any(square_outside(base, block.size) <= Num(block.reach * block.reach))) continue;
+    for (int c = block.first_pair; c < block.last_pair; ++c) block_pair(w, c, block, in);
   }
 }
 
@@ -163,6 +223,7 @@ FUNCTION void find_constraints(Worlds& w) {
     }
   }
   floor_contacts(w);
-  if constexpr (NPAIRS > 0) pair_contacts(w);
+  if constexpr (NSEGMENT_PAIRS > 0) pair_contacts(w);
+  if constexpr (NBLOCK_PAIRS > 0) block_contacts(w);
   limits(w);
 }

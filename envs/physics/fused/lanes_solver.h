@@ -150,9 +150,9 @@ FUNCTION void add_column(Worlds& w, const Slot& s, const Edges& e, int j, int do
   along[2] = e.normal_second * normal + e.second * second;
 }
 
-// Contacts with N columns; where no pairs are, the first of them are the root's.
+// Contacts with N columns; where all are the root's too, its columns are the first.
 template <int N> FUNCTION void add_contact(Worlds& w, const Slot& s, const Edges& e) {
-  constexpr auto known = [](int column) { return NPAIRS == 0 && column < FIRST; };
+  constexpr auto known = [](int column) { return ROOTED && column < FIRST; };
   repeat<0, N>([&](auto j) INLINE {
     Num along[3];
     const int dof = known(j) ? int(j) : s.dofs[j];
@@ -167,7 +167,7 @@ template <int N> FUNCTION void add_contact(Worlds& w, const Slot& s, const Edges
 FUNCTION void add_contact(Worlds& w, const Slot& s, const Edges& e) {
   if constexpr (UNROLLED) {
     repeat<1, MOST_COLUMNS + 1>([&](auto n) INLINE {
-      if constexpr (NPAIRS > 0 || decltype(n)::value >= FIRST) {
+      if constexpr (!ROOTED || decltype(n)::value >= FIRST) {
         if (s.columns == n) add_contact<decltype(n)::value>(w, s, e);
       }
     });

@@ -5,6 +5,7 @@
 
 constexpr int FIRST = HAS_FREE ? 6 : 0;  // degree of freedom of the first joint
 constexpr int CANDIDATES = NPOINTS + 2 * NPAIRS;
+constexpr int MOST_SLOTS = CANDIDATES < MOST_CONTACTS * LANES ? CANDIDATES : MOST_CONTACTS * LANES;
 // Loops over small trees are unrolled, so that indices are constants and small arrays stay in registers.
 constexpr bool UNROLLED = NV <= 16 && !FILLS;
 
@@ -14,6 +15,7 @@ constexpr bool reads(int field) {
   }
   return false;
 }
+constexpr int NSEGMENT_PAIRS = NPAIRS - NBLOCK_PAIRS;  // those of two segments are the first
 constexpr bool FLUID = NBOXES > 0;
 constexpr bool READS_FORCES = reads(CFRC_EXT);
 
@@ -66,7 +68,7 @@ struct alignas(64) Worlds {
   // The problem: minimise (a - smooth) M (a - smooth) / 2 and the constraints' cost.
   Num M[NV][NV], H[NV][NV], smooth[NV];
   Num a[NV], Ma[NV], gradient[NV], step[NV], M_step[NV];
-  Slot slots[at_least_one(CANDIDATES)];
+  Slot slots[at_least_one(MOST_SLOTS)];
   int slot_count, limit_count, limits[at_least_one(NLIMITS)];  // those that some world has
   Num limit_weight[at_least_one(NLIMITS)], limit_residual[at_least_one(NLIMITS)];
   Num limit_change[at_least_one(NLIMITS)], limit_sign[at_least_one(NLIMITS)];

@@ -1,8 +1,8 @@
 """Tables of a compiled MjModel that the fused step is generated from, and what it cannot step.
 
 The step knows a tree of slides and hinges on the world or on one free root; spheres and capsules that touch horizontal
-planes and one another; pyramidal cones, limits, springs, damping, fluid by inertia boxes; Euler and RK4. Nothing here
-depends on the robot.
+planes, boxes and one another; pyramidal cones, limits, springs, damping, fluid by inertia boxes; Euler and RK4.
+Nothing here depends on the robot.
 
 Bodies without joints are lumped into the moving body they are welded to. Moving body 0 is the base: the free root, or
 the world. All places and axes below are in the frame of a moving body.
@@ -34,7 +34,9 @@ _MINIMP, _MAXIMP = 1e-4, 0.9999  # mjMINIMP, mjMAXIMP
 _MINMU = 1e-5  # mjMINMU
 
 _FREE, _BALL, _SLIDE, _HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{x}")) for x in ("FREE", "BALL", "SLIDE", "HINGE"))
-_PLANE, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("PLANE", "SPHERE", "CAPSULE"))
+_PLANE, _SPHERE, _CAPSULE, _BOX = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("PLANE", "SPHERE", "CAPSULE", "BOX")
+)
 _EULER, _RK4 = int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4)
 _Disable = mujoco.mjtDisableBit
 # What these switch off is computed here in no other way: searches for islands and for colliding boxes.
@@ -210,11 +212,31 @@ class Segment:
 
 
 @dataclasses.dataclass(frozen=True)
+class Block:
+    """A box that segments may touch.
+
+    Attributes:
+      body: moving body; -1 for the world where the base is a free root. place: body of the MjModel, for forces on it.
+      axes: [3, 3], rows are the box's axes. offset: [3] m, its middle along them. size: [3] m, half widths.
+      reach: m, from the base's origin to the box: further away no segment of a free root can touch it; else infinite.
+    """
+
+    body: int
+    place: int
+    axes: np.ndarray
+    offset: np.ndarray
+    size: np.ndarray
+    reach: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two segments that may touch.
+    """Two segments, or a box and a segment, that may touch.
 
     Attributes:
       first, second: indices into `Tables.segments`, in MuJoCo's order: the normal points from the first to the second.
+      with_block: the first is an index into `Tables.blocks`.
+      rooted: the free root's dofs are among `dofs`.
       dofs: degrees of freedom that move one of the two only, ascending.
       signs: 1 where a dof moves the second, -1 where it moves the first.
       contact: see `Contact`.
@@ -222,6 +244,8 @@ class Pair:
 
     first: int
     second: int
+    with_block: bool
+    rooted: bool
     dofs: tuple[int, ...]
     signs: tuple[int, ...]
     contact: Contact
@@ -278,7 +302,7 @@ class Tables:
       has_free: moving body 0 is a free root with dofs 0 to 5 (world axes, then the root's); else it is the world.
       bodies, joints, places: see their classes. Bodies and joints: parents first.
       boxes: of a fluid; empty without. density: kg/m3. viscosity: Pa s.
-      points, segments, pairs, limits, motors: see their classes.
+      points, segments, blocks, pairs, limits, motors: see their classes. Pairs: those with blocks last, block by block.
       ancestors: for each dof those before it on its chain, descending: M's pattern below the diagonal.
       fills: a pair's contact couples dofs that M does not.
       most_contacts: of one world at a time; one with more reports `overflow`.
@@ -307,6 +331,7 @@ class Tables:
     viscosity: float
     points: tuple[Point, ...]
     segments: tuple[Segment, ...]
+    blocks: tuple[Block, ...]
     pairs: tuple[Pair, ...]
     limits: tuple[Limit, ...]
     motors: tuple[Motor, ...]
@@ -325,13 +350,23 @@ class Tables:
         """Numbers in all readouts."""
         return sum(FIELDS[reading.field] * len(reading.rows) for reading in self.readings.values())
 
+    @property
+    def rooted(self) -> bool:
+        """Whether every contact is moved by all the root's dofs."""
+        return all(pair.rooted for pair in self.pairs)
+
+    def reach(self, pair: Pair) -> float:
+        """m, between the middles of two segments, or a segment's and a box: further apart they cannot touch."""
+        both = [self.segments[k] for k in ((pair.second,) if pair.with_block else (pair.first, pair.second))]
+        return pair.contact.margin + sum(s.radius + float(np.linalg.norm(s.half)) for s in both)
+
 
 def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None) -> Tables:
     """The tables of a model without an `obstacle`; `contacts` of one world at a time, derived if None."""
     m = model
     tree = _Tree(m)
     points = tuple(_points(m, tree))
-    segments, pairs = _pairs(m, tree)
+    segments, blocks, pairs = _pairs(m, tree)
     chains = [body.chain for body in tree.bodies]
     stiffness, spring, qpos_of_dof = _springs(m)
     fluid = bool(m.opt.density or m.opt.viscosity)
@@ -356,6 +391,7 @@ def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int
         viscosity=float(m.opt.viscosity),
         points=points,
         segments=segments,
+        blocks=blocks,
         pairs=pairs,
         limits=tuple(_limits(m)),
         motors=tuple(_motors(m)),
@@ -383,7 +419,7 @@ class _Tree:
         self.moving = [] if self.has_free else [0]  # bodies of the MjModel
         self.joints: list[Joint] = []
         self.places: list[Place] = []
-        parents = [] if self.has_free else [0]
+        parents = self._parents = [] if self.has_free else [0]
         for b in range(m.nbody):
             self.places.append(self._place(b, parents))
         chains = self._chains(parents)
@@ -474,6 +510,11 @@ class _Tree:
             tuple(sorted([*root, *(dof for a in self._above(k, parents) for dof in own[a])]))
             for k in range(len(self.moving))
         ]
+
+    def furthest(self, body: int) -> float:
+        """m, how far a moving body's origin can be from the base's; slides are endless."""
+        own = [joint for above in self._above(body, self._parents) for joint in self.joints if joint.body == above]
+        return sum(_length(j.anchor) + _length(j.position) if j.hinge else np.inf for j in own)
 
     def _lumped(self, body: int) -> tuple[float, np.ndarray, np.ndarray]:
         """Mass, centre of mass and inertia of all that is welded to a moving body."""
@@ -621,18 +662,41 @@ def _points(m: mujoco.MjModel, tree: _Tree) -> Iterator[Point]:
             yield Point(segment.body, segment.place, centre, axis, segment.radius, height, contact)
 
 
-def _pairs(m: mujoco.MjModel, tree: _Tree) -> tuple[tuple[Segment, ...], tuple[Pair, ...]]:
+def _pairs(m: mujoco.MjModel, tree: _Tree) -> tuple[tuple[Segment, ...], tuple[Block, ...], tuple[Pair, ...]]:
     found = [pair for pair in collisions(m) if m.geom_type[pair[0]] != _PLANE]
-    geoms = sorted({geom for pair in found for geom in pair})
+    boxes = sorted({pair[1] for pair in found if m.geom_type[pair[1]] == _BOX})
+    # A box comes first, where MuJoCo has it second: a pyramid's edges are the same from either side.
+    found = [pair if pair[1] not in boxes else pair[::-1] for pair in found]
+    found.sort(key=lambda pair: boxes.index(pair[0]) if pair[0] in boxes else -1)
+    geoms = sorted({geom for pair in found for geom in pair if geom not in boxes})
     segments = tuple(_segment(m, tree, geom) for geom in geoms)
+    blocks = tuple(_block(m, tree, box, [segments[geoms.index(g)] for b, g in found if b == box]) for box in boxes)
     pairs = []
     for pair in found:
-        first, second = (geoms.index(geom) for geom in pair)
-        chains = [set(tree.bodies[segments[k].body].chain) for k in (first, second)]
+        with_block = pair[0] in boxes
+        first, second = (boxes if with_block else geoms).index(pair[0]), geoms.index(pair[1])
+        bodies = (blocks if with_block else segments)[first].body, segments[second].body
+        chains = [set(tree.bodies[body].chain) if body >= 0 else set() for body in bodies]
         dofs = tuple(sorted(chains[0] ^ chains[1]))
         signs = tuple(1 if dof in chains[1] else -1 for dof in dofs)
-        pairs.append(Pair(first, second, dofs, signs, contact_of(m, *pair)))
-    return segments, tuple(pairs)
+        pairs.append(Pair(first, second, with_block, bodies[0] < 0, dofs, signs, contact_of(m, *pair)))
+    return segments, blocks, tuple(pairs)
+
+
+def _block(m: mujoco.MjModel, tree: _Tree, geom: int, segments: list[Segment]) -> Block:
+    b = int(m.geom_bodyid[geom])
+    place = tree.places[b]
+    axes = (place.rotation @ _matrix(m.geom_quat[geom])).T
+    centre = place.position + place.rotation @ m.geom_pos[geom]
+    reach = np.inf
+    if place.body < 0:
+        margin = float(m.geom_margin[geom] + m.geom_margin.max())
+        reach = margin + max(tree.furthest(s.body) + _length(s.centre) + _length(s.half) + s.radius for s in segments)
+    return Block(place.body, b, axes, axes @ centre, np.array(m.geom_size[geom]), 1.0001 * reach)
+
+
+def _length(vector: np.ndarray) -> float:
+    return float(np.linalg.norm(vector))
 
 
 def _segment(m: mujoco.MjModel, tree: _Tree, geom: int) -> Segment:
@@ -760,14 +824,14 @@ def _refused_contacts(m: mujoco.MjModel) -> Iterator[str]:
         types = [int(m.geom_type[x]) for x in (g, h)]
         plane = types[0] == _PLANE
         known = (_SPHERE, _CAPSULE)
-        if not (plane or types[0] in known) or types[1] not in known:
+        if not ((plane or types[0] in known) and types[1] in known or types[0] in known and types[1] == _BOX):
             kinds = " and ".join(mujoco.mjtGeom(t).name.removeprefix("mjGEOM_").lower() for t in types)
-            yield f"geoms {names} may touch ({kinds}); it knows spheres and capsules on planes and on each other"
+            yield f"geoms {names} may touch ({kinds}); it knows spheres and capsules on planes, boxes and each other"
         static = [m.body_weldid[m.geom_bodyid[x]] == 0 for x in (g, h)]
         if plane and not (static[0] and _upright(m, g)):
             yield f"plane {names.split(' and ')[0]} moves or is not horizontal"
-        if not plane and base and any(static):
-            yield f"geoms {names} may touch, and one of them is fixed to the world"
+        if not plane and base and (static[0] or static[1] and types[1] != _BOX):
+            yield f"geoms {names} may touch, and a sphere or capsule of them is fixed to the world"
         condim, _, solref, solimp = _mixed(m, g, h)
         if condim not in (1, 3) or not _plain(solref, solimp):
             yield f"geoms {names} touch with condim {condim}, or with an unusual solref or solimp"

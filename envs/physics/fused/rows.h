@@ -40,9 +40,13 @@ struct SegmentRow {
   int body, place, capsule;
   Real centre[3], half[3], side[3], radius;
 };
+struct BlockRow {
+  int body, place, first_pair, last_pair;  // its pairs are those from first to before last
+  Real axes[9], offset[3], size[3], reach;
+};
 struct PairRow {
-  int first, second, columns;
-  Real reach;  // m, between the middles: further apart they cannot touch
+  int first, second, columns, rooted;  // whether the first columns are the root's
+  Real reach;                          // m, between the middles, or a middle and a block: further apart they cannot touch
   ContactRow contact;
 };
 struct LimitRow {

@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .model import FIELDS, Contact, Impedance, Pair, Tables
+from .model import FIELDS, Contact, Impedance, Tables
 
 LANES = 32
 MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
+MOST_SEGMENTS, MOST_PAIRS = 512, 4096  # what a multiprocessor's memory has room for in each of its worlds
 
 _LONGEST_TRUNK = 9  # its triangle is in every lane's registers
 _ROUND_COST = 60.0  # of a round of the branches, in a trunk's multiplications
@@ -40,14 +41,18 @@ class Schedule(NamedTuple):
 def obstacle(tables: Tables) -> str | None:
     """Why a warp cannot step a world of the model, as the rest of a sentence; None if it can."""
     sizes = {
-        "degrees of freedom": tables.nv,
-        "joints": len(tables.joints),
-        "moving bodies": len(tables.bodies),
-        "joints with limits": len(tables.limits),
-        "bodies in a fluid": len(tables.boxes),
+        "degrees of freedom": (tables.nv, LANES),
+        "joints": (len(tables.joints), LANES),
+        "moving bodies": (len(tables.bodies), LANES),
+        "joints with limits": (len(tables.limits), LANES),
+        "bodies in a fluid": (len(tables.boxes), LANES),
+        "spheres and capsules that may touch others": (len(tables.segments), MOST_SEGMENTS),
+        "pairs of geoms that may touch": (len(tables.pairs), MOST_PAIRS),
     }
-    wrong = [f"{size} {what}" for what, size in sizes.items() if size > LANES]
-    return f"cannot step this model: it has {wrong[0]}, and a warp takes {LANES}" if wrong else None
+    for what, (size, most) in sizes.items():
+        if size > most:
+            return f"cannot step this model: it has {size} {what}, and a warp takes {most}"
+    return None
 
 
 def schedule(tables: Tables) -> Schedule:
@@ -193,6 +198,7 @@ def _sizes(out: _Writer, t: Tables) -> None:
         JOINTS=len(t.joints),
         POINTS=len(t.points),
         PAIRS=len(t.pairs),
+        BLOCK_PAIRS=sum(p.with_block for p in t.pairs),
         SEGMENTS=len(t.segments),
         OWN_SLOTS=own,
         SLOTS=max(1, len(t.points) if own else min(MOST_SLOTS, t.most_contacts)),
@@ -379,8 +385,13 @@ def _contacts(out: _Writer, t: Tables) -> None:
         out.vectors("segment_half", (s.half for s in t.segments))
         out.scalars("segment_body", (s.body for s in t.segments), "int")
         out.vectors("segment_side", (s.side for s in t.segments))
-    out.scalars("pair_segments", (p.first | p.second << 8 for p in t.pairs), "unsigned")
-    out.scalars("pair_far", (_far(t, p) for p in t.pairs))
+    with out.record("block"):
+        out.matrices("block_axes", (b.axes for b in t.blocks))
+        out.vectors("block_offset", (b.offset for b in t.blocks))
+        out.vectors("block_size", (b.size for b in t.blocks))
+        out.scalars("block_body", (b.body for b in t.blocks), "int")
+    out.scalars("pair_segments", (p.first | p.second << 16 for p in t.pairs), "unsigned")
+    out.scalars("pair_far", (1.0001 * t.reach(p) ** 2 for p in t.pairs))
     contacts: list[Contact] = [p.contact for p in (*t.points, *t.pairs)]
     related = [{d, *t.ancestors[d]} for d in range(t.nv)]
     fills = [any(a not in related[b] and b not in related[a] for a in p.dofs for b in p.dofs) for p in t.pairs]
@@ -394,17 +405,10 @@ def _contacts(out: _Writer, t: Tables) -> None:
         out.scalars("contact_dofs", dofs, "unsigned")
         out.scalars("contact_opposite", [0] * len(t.points) + minus, "unsigned")
         out.scalars("contact_fills", [False] * len(t.points) + fills, "bool")
-    first = [-1] * len(t.points) + [t.segments[p.first].place for p in t.pairs]
+    first = [-1] * len(t.points) + [(t.blocks if p.with_block else t.segments)[p.first].place for p in t.pairs]
     second = [p.place for p in t.points] + [t.segments[p.second].place for p in t.pairs]
     out.scalars("contact_first_place", first, "int")
     out.scalars("contact_second_place", second, "int")
-
-
-def _far(t: Tables, pair: Pair) -> float:
-    """m2, the square of the distance of two middles beyond which no contact is possible."""
-    both = [t.segments[k] for k in (pair.first, pair.second)]
-    reach = sum(float(np.linalg.norm(s.half)) + s.radius for s in both) + pair.contact.margin
-    return 1.0001 * reach**2
 
 
 def _limits(out: _Writer, t: Tables) -> None:

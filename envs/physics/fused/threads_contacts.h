@@ -2,6 +2,18 @@
 #pragma once
 #include "threads_smooth.h"
 
+// boxes.h for a single world.
+typedef real Real;
+typedef real Num;
+typedef bool Mask;
+#define FUNCTION DEVICE
+DEVICE real select(bool which, real yes, real no) { return which ? yes : no; }
+DEVICE bool any(bool truth) { return truth; }
+DEVICE bool differ(bool a, bool b) { return a != b; }
+DEVICE real size_of(real x) { return absolute(x); }
+DEVICE real clip(real x, real low, real high) { return clamped(x, low, high); }
+#include "boxes.h"
+
 // A lane's contact: its four edges are normal +- first, normal +- second; the tangents' Jacobians are times friction.
 struct Contact {
   bool exists;
@@ -118,19 +130,50 @@ DEVICE void place_segments(World& w) {
   MEET();
 }
 
-// Lists the pairs whose bounding spheres touch, and returns how many.
+// A block as the base's frame has it: a point of that frame is at axes * point + shift of the block's.
+struct BlockFrame {
+  Mat axes;
+  Vec shift;
+};
+
+DEVICE BlockFrame frame_of(const World& w, int block) {
+  const int body = block_body(block);
+  const Mat own = block_axes(block);
+  const Vec offset = block_offset(block);
+#if FREE
+  if (body < 0) {  // fixed to the world, in which the root is; a place far from the origin keeps its digits
+    return {mul(own, mat_at(w.base)), mul(own, vec_at(w.qpos)) - offset};
+  }
+#endif
+  const Mat axes = mul(own, transposed(mat_at(w.pose[body])));
+  return {axes, vec(0, 0, 0) - mul(axes, vec_at(w.pose[body] + 9)) - offset};
+}
+
+// Pairs with blocks are the last; where all pairs or none are so, the compiler knows.
+DEVICE bool has_block(int pair) { return BLOCK_PAIRS > 0 && (BLOCK_PAIRS == PAIRS || pair >= PAIRS - BLOCK_PAIRS); }
+
+// Whether two bounding spheres touch, or one and a block.
+DEVICE bool is_near(const World& w, int pair) {
+  const unsigned parts = pair_segments(pair);
+  const Vec middle = vec_at(w.segment[parts >> 16]);
+  if (!has_block(pair)) {
+    const Vec between = vec_at(w.segment[parts & 65535]) - middle;
+    return dot(between, between) <= pair_far(pair);
+  }
+  const BlockFrame in = frame_of(w, parts & 65535);
+  real place[3], size[3];
+  put(place, mul(in.axes, middle) + in.shift);
+  put(size, block_size(parts & 65535));
+  return square_outside(place, size) <= pair_far(pair);
+}
+
+// Lists the pairs that may touch, and returns how many.
 DEVICE int list_near(World& w) {
   int found = 0;
   ROLLED for (int start = 0; start < PAIRS; start += LANES) {
     PerLane<bool> near;
     EACH_LANE {
-      const int pair = start + lane;
-      near[ME] = false;
-      if (pair < PAIRS) {
-        const unsigned segments = pair_segments(pair);
-        const Vec between = vec_at(w.segment[segments & 255]) - vec_at(w.segment[segments >> 8]);
-        near[ME] = dot(between, between) <= pair_far(pair);
-      }
+      near[ME] = start + lane < PAIRS && is_near(w, start + lane);
     }
     const unsigned hits = ballot(near);
     EACH_LANE if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
@@ -143,7 +186,7 @@ DEVICE int list_near(World& w) {
 // mjraw_SphereSphere at the nearest places. Segments that cross have no normal: MuJoCo takes a product of two axes.
 DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
   const unsigned segments = pair_segments(pair);
-  const int first = segments & 255, second = segments >> 8;
+  const int first = segments & 65535, second = segments >> 16;
   const real radii = segment_radius(first) + segment_radius(second), reach = radii + contact_margin(POINTS + pair);
   const Nearest found = nearest_of(vec_at(w.segment[first]), vec_at(w.segment[first] + 3), vec_at(w.segment[second]),
                                    vec_at(w.segment[second] + 3), reach, which);
@@ -162,6 +205,34 @@ DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
   touch.normal = normal;
   touch.point = found.from + normal * (segment_radius(first) + real(0.5) * touch.distance);
   touch.tangent = absolute(dot(side, normal)) < real(0.5) ? side : world_up(w);
+  return true;
+}
+
+// A block and a segment: a contact of each of the segment's spheres.
+DEVICE bool touches_block(const World& w, int pair, int which, Touch& touch) {
+  const unsigned parts = pair_segments(pair);
+  const int segment = parts >> 16;
+  const BlockFrame in = frame_of(w, parts & 65535);
+  const Vec middle = vec_at(w.segment[segment]), half = vec_at(w.segment[segment] + 3);
+  real size[3], out[3], centre[3], axis[3];
+  put(size, block_size(parts & 65535));
+  put(centre, mul(in.axes, middle) + in.shift);
+  put(axis, mul(in.axes, half));
+  real share = 0;
+  if (dot(half, half) > 0) {
+    const Spheres spheres = spheres_on_box(centre, axis, size);
+    if (which && !spheres.two) return false;
+    share = which ? spheres.second : spheres.first;
+  } else if (which) {
+    return false;
+  }
+  for (int k = 0; k < 3; ++k) centre[k] += axis[k] * share;
+  touch.distance = sphere_on_box(centre, segment_radius(segment), size, out);
+  if (!(touch.distance <= contact_margin(POINTS + pair))) return false;
+  touch.normal = mul_transposed(in.axes, vec_at(out));
+  touch.point = middle + half * share - touch.normal * (segment_radius(segment) + real(0.5) * touch.distance);
+  const Vec side = world_side(w);
+  touch.tangent = absolute(dot(side, touch.normal)) < real(0.5) ? side : world_up(w);
   return true;
 }
 #endif
@@ -215,7 +286,8 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
     EACH_LANE {
       const int item = start + lane, pair = item < 2 * near ? w.near[item >> 1] : 0;
       candidate[ME] = POINTS + pair;
-      hit[ME] = item < 2 * near && touches_pair(w, pair, item & 1, touch[ME]);
+      hit[ME] = item < 2 * near && (has_block(pair) ? touches_block(w, pair, item & 1, touch[ME])
+                                                    : touches_pair(w, pair, item & 1, touch[ME]));
     }
     found = take(w, hit, candidate, touch, found);
   }

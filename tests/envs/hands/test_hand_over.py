@@ -383,7 +383,6 @@ def test_decoration_shows_the_goal_and_reddens_the_finger_only_when_it_costs():
     [
         ({"object": "eg"}, "did you mean 'egg'"),
         ({"egg": "elipsoid"}, "did you mean 'ellipsoid'"),
-        ({"solver": "x"}, "solver"),
     ],
 )
 def test_mistakes_get_one_sentence(options, said):

@@ -18,6 +18,7 @@ import envs
 from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
+from envs.hands import hand_over
 from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
 from paths import ROOT
@@ -92,6 +93,35 @@ def test_c_engine_is_a_plain_loop_over_mujoco(readout):
         np.testing.assert_array_equal(after.warmstart[i], data.qacc_warmstart.astype(np.float32))
         for name, (field, index) in readout.items():
             np.testing.assert_array_equal(out[name][i], getattr(data, field)[index].astype(np.float32))
+
+
+@both
+@pytest.mark.parametrize("substeps", [0, 3])
+def test_a_forward_pass_makes_readouts_those_of_the_new_state(readout, substeps):
+    state, ctrl = starts(3)
+    readout = {**readout, "acceleration": ("qacc", slice(None))}
+    made = physics.make_engine(corridor.model(), substeps=substeps, readout=readout, forward=True, physics="mujoco")
+    after, out = jax.vmap(made.step)(state, ctrl)
+    model = corridor.model()
+    data = mujoco.MjData(model)
+    for i in range(3):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state.qpos[i], state.qvel[i], ctrl[i]
+        mujoco.mj_step(model, data, substeps)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
+        np.testing.assert_array_equal(after.qpos[i], data.qpos.astype(np.float32))
+        for name, (field, index) in readout.items():
+            np.testing.assert_array_equal(out[name][i], getattr(data, field)[index].astype(np.float32))
+    np.testing.assert_array_equal(out["torso"], after.qpos[:, :3])  # which RK4 alone leaves a stage behind
+
+
+def test_fused_has_no_forward_pass_and_auto_takes_another():
+    reason = contract.obstacle("fused", corridor.model(), {}, forward=True)
+    assert reason is not None and ("no forward pass" in reason or "compiler" in reason)
+    assert physics.resolve("auto", corridor.model(), {}, forward=True) == "mujoco"
+    with pytest.raises(TaskError, match="physics 'fused' "):
+        physics.make_engine(corridor.model(), substeps=5, readout={}, forward=True, physics="fused")
 
 
 @both
@@ -390,9 +420,11 @@ def test_on_a_gpu_warp_takes_what_fused_cannot_step(monkeypatch):
     monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
     monkeypatch.setattr(contract, "installed_version", lambda _: "1.18")
     assert physics.resolve("auto", walls.model()) == "fused"
-    assert physics.resolve("auto", walls.model("solid")) == "warp"
+    assert physics.resolve("auto", walls.model("solid")) == "fused"
+    hands = hand_over.model()
+    assert physics.resolve("auto", hands) == "warp"
     with pytest.raises(TaskError, match=r"cannot step this model: .* \(take 'warp'\)"):
-        physics.resolve("fused", walls.model("solid"))
+        physics.resolve("fused", hands)
 
 
 def test_room_for_contacts_in_warp():

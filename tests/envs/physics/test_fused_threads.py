@@ -2,196 +2,87 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 
 import mujoco
 import numpy as np
 import pytest
 
-from envs.ant import corridor, walls
 from envs.errors import TaskError
 from envs.physics.fused import nvrtc, threads
-from envs.physics.fused.model import FIELDS, Tables, obstacle, tables
-from envs.velocity import robots
-from threads_on_cpu import Rows, compiled, runner
-
-READOUT = {field: (field, slice(None)) for field in FIELDS if field != "subtree_com"} | {"com": ("subtree_com", 1)}
-FIRST = ("corridor", "hopper", "swimmer", "humanoid")  # between them they have all that the others have
-FULL = ("ant", "half_cheetah", "walker2d")
-every_robot = pytest.mark.parametrize("robot", [*FIRST, *(pytest.param(x, marks=pytest.mark.full) for x in FULL)])
-States = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, warm start, ctrl
-
-
-def exact(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose solver goes on to the end, where C would stop at an improvement of 1e-8."""
-    model = copy.copy(model)
-    model.opt.tolerance, model.opt.ls_tolerance = 0.0, 1e-6
-    return model
-
-
-def model_of(robot: str) -> tuple[mujoco.MjModel, int]:
-    if robot == "corridor":
-        return exact(walls.model()), corridor.SUBSTEPS
-    return exact(robots.model(robot)), robots.ROBOTS[robot].substeps
+from envs.physics.fused.model import Tables, obstacle, tables
+from stepping import ROBOTS, THIN, Rows, answers, anywhere, by_c, errors, exact, kinds, model_of, readout_of, states
+from threads_on_cpu import compiled, runner
 
 
 @functools.cache
 def made(robot: str) -> tuple[mujoco.MjModel, Tables]:
     model, substeps = model_of(robot)
-    return model, tables(model, substeps, READOUT)
+    return model, tables(model, substeps, readout_of(model))
 
 
-def by_c(model: mujoco.MjModel, made_of: Tables, states: States, substeps: int) -> Rows:
-    """What MuJoCo makes of the states; no substeps: qacc."""
-    data, rows = mujoco.MjData(model), []
-    for qpos, qvel, warm, ctrl in zip(*states, strict=True):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warm, ctrl
-        if substeps:
-            mujoco.mj_step(model, data, substeps)
-        else:
-            mujoco.mj_forward(model, data)
-        mujoco.mj_rnePostConstraint(model, data)
-        read = [np.asarray(getattr(data, r.field))[list(r.rows)].ravel() for r in made_of.readings.values()]
-        warmstart = data.qacc_warmstart if substeps else data.qacc
-        rows.append([data.qpos.copy(), data.qvel.copy(), warmstart.copy(), np.concatenate([np.zeros(0), *read])])
-    return dict(zip(("qpos", "qvel", "warmstart", "read"), map(np.array, zip(*rows, strict=True)), strict=True))
+def by_threads(model: mujoco.MjModel, made_of: Tables, rows: np.ndarray, dtype: type = np.float64, **options) -> Rows:
+    """What the step makes of rows [n, qpos qvel warm start ctrl], the readouts one after another as `read`."""
+    return runner(made_of, dtype)(*np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1), **options)
 
 
-def visited(model: mujoco.MjModel, substeps: int, count: int) -> States:
-    """States along rollouts with random controls from near the reference pose."""
-    rng, data, rows = np.random.default_rng(0), mujoco.MjData(model), []
-    while len(rows) < count:
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] += rng.uniform(-0.1, 0.1, model.nq)
-        data.qvel[:] = 0.1 * rng.normal(size=model.nv)
-        if model.jnt_type[0] == 0:
-            data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
-        size = rng.choice([0.1, 0.5, 1.0]) * model.actuator_ctrlrange[:, 1]
-        for k in range(40):
-            data.ctrl[:] = rng.uniform(-1.2, 1.2, model.nu) * size
-            if k % 4 == 3:
-                rows.append([x.copy() for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)])
-            mujoco.mj_step(model, data, substeps)
-    qpos, qvel, warm, ctrl = (np.array(x) for x in zip(*rows[:count], strict=True))
-    return qpos, qvel, warm, ctrl
+def flat(made_of: Tables, right: Rows) -> Rows:
+    """C's rows, the readouts one after another as `read`."""
+    count = len(right["qpos"])
+    read = [right[name].reshape(count, -1) for name in made_of.readings]
+    return {name: right[name] for name in ("qpos", "qvel", "warmstart")} | {
+        "read": np.concatenate([np.zeros((count, 0)), *read], axis=1)
+    }
 
 
-def anywhere(model: mujoco.MjModel, count: int, low: float = 0.05, high: float = 1.6) -> States:
-    """States in any attitude, a free root `low` to `high` m over the floor, joints up to 0.2 beyond their limits."""
-    rng = np.random.default_rng(1)
-    qpos = np.tile(model.qpos0, (count, 1))
-    for j in range(model.njnt):
-        a, kind = model.jnt_qposadr[j], model.jnt_type[j]
-        if kind == 0:
-            quat = rng.normal(size=(count, 4))
-            qpos[:, a + 2] = rng.uniform(low, high, count)
-            qpos[:, a + 3 : a + 7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
-        elif model.jnt_limited[j]:
-            qpos[:, a] = rng.uniform(model.jnt_range[j, 0] - 0.2, model.jnt_range[j, 1] + 0.2, count)
-        else:
-            qpos[:, a] += rng.uniform(-1.5, 1.5, count) if kind == 3 else rng.uniform(-0.5, 0.2, count)
-    shape = (count, model.nv)
-    return qpos, 2 * rng.normal(size=shape), np.zeros(shape), rng.uniform(-1.2, 1.2, (count, model.nu))
+def check(model: mujoco.MjModel, made_of: Tables, rows: np.ndarray, right: tuple[Rows, Rows], loose: float) -> None:
+    """qacc, one control step and all readouts, in double precision. MuJoCo itself jumps at a margin: a few rows may.
 
-
-def on_margins(model: mujoco.MjModel, count: int) -> States:
-    """States whose lowest point is 1e-7 m within or beyond its margin."""
-    qpos, qvel, warm, ctrl = anywhere(model, count, 0.3, 0.3)
-    up = next(
-        int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.jnt_type[j] == 0 or model.jnt_axis[j][2] == 1
-    )
-    up += 2 * (model.jnt_type[0] == 0)
-    data = mujoco.MjData(model)
-    for k, row in enumerate(qpos):
-        row[up] -= 2.0  # far enough into the floor that all touches it
-        data.qpos[:] = row
-        mujoco.mj_forward(model, data)
-        plane = [c.dist - c.includemargin for c in data.contact[: data.ncon] if c.geom[0] == 0]
-        row[up] -= min(plane) + (1e-7 if k % 2 else -1e-7)
-    return qpos, qvel, warm, ctrl
-
-
-def error(found: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """[n], the largest in each row, relative to numbers above 1."""
-    return (np.abs(found - right) / np.maximum(1.0, np.abs(right).max(axis=1, keepdims=True))).max(axis=1)
-
-
-def check(model: mujoco.MjModel, made_of: Tables, states: States, loose: float = 0.97) -> None:
-    """qacc, one control step and all readouts, in double precision. MuJoCo itself jumps at a margin: a few rows may."""
-    run = runner(made_of, np.float64)
-    right, found = by_c(model, made_of, states, 0), run(*states, whole=False)
+    Args:
+      right: by C, of the states' own acceleration and of the step. loose: the share of rows that must agree.
+    """
+    expected, found = flat(made_of, right[0]), by_threads(model, made_of, rows, whole=False)
     assert not found["overflow"].any()
-    assert error(found["warmstart"], right["warmstart"]).max() < 1e-7
-    assert np.median(error(found["warmstart"], right["warmstart"])) < 1e-12
-    assert error(found["read"], right["read"]).max() < 1e-6
-    right, found = by_c(model, made_of, states, made_of.substeps), run(*states)
+    wrong = errors(found["warmstart"], expected["warmstart"])
+    assert np.quantile(wrong, loose) < 1e-8 and wrong.max() < 1e-6 and np.median(wrong) < 1e-11
+    assert errors(found["read"], expected["read"]).max() < 1e-5
+    expected, found = flat(made_of, right[1]), by_threads(model, made_of, rows)
     for name, tolerance in (("qpos", 1e-12), ("qvel", 1e-10), ("warmstart", 1e-8), ("read", 1e-8)):
-        wrong = error(found[name], right[name])
-        assert np.quantile(wrong, loose) < tolerance and wrong.max() < 1e-3, name
+        wrong = errors(found[name], expected[name])
+        assert np.quantile(wrong, loose) < tolerance and wrong.max() < 1e-2, name
+
+
+SWEEP = [(robot, kind, False) for robot in (*THIN, "walls") for kind in kinds(robot)]
+SWEEP += [pytest.param(robot, kind, True, marks=pytest.mark.full) for robot in ROBOTS for kind in kinds(robot)]
 
 
 @compiled
-@every_robot
-def test_visited_states_step_as_in_c(robot):
-    model, made_of = made(robot)
-    check(model, made_of, visited(model, made_of.substeps, 100))
+@pytest.mark.parametrize(("robot", "kind", "full"), SWEEP)
+def test_accelerations_steps_and_readouts_are_mujocos(robot, kind, full):
+    right = answers(robot, kind, full, True), answers(robot, kind, full)
+    check(*made(robot), states(robot, kind, full), right, 0.97 if kind == "visited" else 0.8)
 
 
 @compiled
-@pytest.mark.full
-@pytest.mark.parametrize("robot", [*FIRST, *FULL])
-def test_six_hundred_visited_states_step_as_in_c(robot):
-    model, made_of = made(robot)
-    check(model, made_of, visited(model, made_of.substeps, 600))
-
-
-@compiled
-@every_robot
-def test_any_attitude_and_violated_limits_step_as_in_c(robot):
-    model, made_of = made(robot)
-    check(model, made_of, anywhere(model, 60))
-
-
-@compiled
-@pytest.mark.parametrize("robot", ["corridor", "humanoid"])
-def test_lying_on_the_floor_steps_as_in_c(robot):
-    model, made_of = made(robot)
-    states = anywhere(model, 20, 0.12, 0.12)
-    assert by_c(model, made_of, states, 0)["read"].any()
-    check(model, made_of, states, loose=0.8)
-
-
-@compiled
-@pytest.mark.parametrize("robot", ["corridor", "hopper"])
-def test_contacts_on_their_margins_are_those_of_c(robot):
-    model, made_of = made(robot)
-    states, run = on_margins(model, 20), runner(made_of, np.float64)
-    right, found = by_c(model, made_of, states, 0), run(*states, whole=False)
-    assert error(found["warmstart"], right["warmstart"]).max() < 1e-7
-
-
-@compiled
-@every_robot
+@pytest.mark.parametrize("robot", ["walls", *(pytest.param(x, marks=pytest.mark.full) for x in ROBOTS)])
 def test_single_precision_is_close(robot):
     model, made_of = made(robot)
-    states = tuple(x.astype(np.float32).astype(float) for x in visited(model, made_of.substeps, 60))
-    right, found = by_c(model, made_of, states, made_of.substeps), runner(made_of, np.float32)(*states)
-    assert np.median(error(found["qpos"], right["qpos"])) < 1e-6
-    assert np.quantile(error(found["qpos"], right["qpos"]), 0.95) < 2e-5
-    assert np.quantile(error(found["qvel"], right["qvel"]), 0.95) < 1e-3
+    rows = states(robot, kinds(robot)[0]).astype(np.float32).astype(float)
+    right, found = by_c(model, rows, made_of.substeps, {}), by_threads(model, made_of, rows, np.float32)
+    assert np.median(errors(found["qpos"], right["qpos"])) < 1e-6
+    assert np.quantile(errors(found["qpos"], right["qpos"]), 0.95) < 2e-5
+    assert np.quantile(errors(found["qvel"], right["qvel"]), 0.95) < 1e-3
 
 
 @compiled
 def test_contacts_beyond_the_slots_are_reported():
-    model, substeps = model_of("humanoid")
+    """With the floor, and with solid walls; slots of points alone are as many as the points."""
+    model, substeps = model_of("walls")
     made_of = tables(model, substeps, {}, contacts=2)
-    low, high = anywhere(model, 8, 0.1, 0.1), anywhere(model, 8, 3.0, 3.0)
-    qpos = high[0].copy()
-    qpos[:, 7:] = model.qpos0[7:]
-    run = runner(made_of, np.float64)
-    assert run(*low)["overflow"].all() and not run(qpos, *high[1:])["overflow"].any()
+    low, high, walls = anywhere(model, 8, 0.1, 0.1), anywhere(model, 8, 3.0, 3.0), states("walls", "walls")
+    assert by_threads(model, made_of, low)["overflow"].all()
+    assert by_threads(model, made_of, walls)["overflow"].any()
+    assert not by_threads(model, made_of, high)["overflow"].any()
 
 
 # -- models that no task has --
@@ -215,22 +106,25 @@ MIXED = """<mujoco><option integrator='{integrator}' density='{density}' viscosi
   <motor joint='a' gear='-1'/></actuator></mujoco>"""
 
 
+FORCES = {"forces": ("cfrc_ext", slice(None))}
+
+
 @compiled
 @pytest.mark.parametrize(("slide", "turns", "contacts"), [(0.15, (0, 0), 2), (0.0, (0.4, 0), 1), (0.0, (0, 0.4), 1)])
 def test_parallel_and_crossing_capsules_touch_as_in_c(slide, turns, contacts):
     """Parallel capsules touch twice; the axes of crossing ones leave no normal between them."""
     model = exact(mujoco.MjModel.from_xml_string(CROSSED.format(floor=FLOOR)))
-    made_of = tables(model, 1, {"forces": ("cfrc_ext", slice(None))})
+    made_of = tables(model, 1, FORCES)
     data = mujoco.MjData(model)
     data.qpos[7:] = (slide, *turns)
     mujoco.mj_forward(model, data)
     assert data.ncon == contacts
-    states = tuple(x[None] for x in (data.qpos, data.qvel, 0 * data.qvel, data.ctrl))
-    right = by_c(model, made_of, states, 0)
+    row = np.concatenate([data.qpos, data.qvel, 0 * data.qvel, data.ctrl])[None]
+    right = flat(made_of, by_c(model, row, 0, FORCES))
     for dtype, tolerance in ((np.float64, 1e-9), (np.float32, 1e-3)):
-        found = runner(made_of, dtype)(*states, whole=False)
-        assert error(found["warmstart"], right["warmstart"]).max() < tolerance
-        assert error(found["read"], right["read"]).max() < tolerance
+        found = by_threads(model, made_of, row, dtype, whole=False)
+        assert errors(found["warmstart"], right["warmstart"]).max() < tolerance
+        assert errors(found["read"], right["read"]).max() < tolerance
 
 
 @compiled
@@ -245,7 +139,8 @@ def test_trees_that_no_task_has_step_as_in_c(integrator, density):
     rng = np.random.default_rng(2)
     shape = (60, model.nv)
     ctrl = rng.uniform(-2, 2, (60, model.nu))
-    check(model, made_of, (rng.uniform(-0.8, 0.8, shape), rng.normal(size=shape), np.zeros(shape), ctrl), loose=0.9)
+    rows = np.concatenate([rng.uniform(-0.8, 0.8, shape), rng.normal(size=shape), np.zeros(shape), ctrl], axis=1)
+    check(model, made_of, rows, tuple(by_c(model, rows, substeps, readout) for substeps in (0, 3)), 0.9)
 
 
 def random_tree(seed: int) -> str:
@@ -268,15 +163,60 @@ def random_tree(seed: int) -> str:
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.full) for k in range(2, 12))])
 def test_random_trees_step_as_in_c(seed):
     model = exact(mujoco.MjModel.from_xml_string(random_tree(seed)))
-    made_of = tables(model, 2, {"velocity": ("cvel", slice(None))})
-    states = anywhere(model, 30, 0.5, 2.0)
-    check(model, made_of, states, loose=0.9)
+    readout = {"velocity": ("cvel", slice(None))}
+    made_of, rows = tables(model, 2, readout), anywhere(model, 30, 0.5, 2.0)
+    check(model, made_of, rows, tuple(by_c(model, rows, substeps, readout) for substeps in (0, 2)), 0.9)
+
+
+# -- boxes --
+
+AT_A_BOX = """<mujoco><option timestep='.005'/><worldbody>
+  <geom type='box' size='{size}' pos='1 2 3' euler='20 30 40' margin='.02'/>
+  <body><freejoint/><geom type='capsule' size='.08 .3' mass='1'/><geom size='.1' pos='.9 0 0' mass='1'/></body>
+  </worldbody></mujoco>"""
+FORCES_OF_THE_FREE = {"forces": ("cfrc_ext", 1)}
+
+
+def at_a_box(model: mujoco.MjModel, count: int) -> np.ndarray:
+    """A capsule and a sphere in any attitude, and along the box's axes, at its faces, edges and corners and inside."""
+    rng, size = np.random.default_rng(4), model.geom_size[0]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turn, rows = data.geom_xmat[0].reshape(3, 3), np.zeros((count, 7 + 6 + 6))
+    for k, row in enumerate(rows):
+        place = rng.uniform(-1, 1, 3) * (size + 0.1)
+        for axis in rng.choice(3, rng.integers(1, 4), replace=False):  # beside a face, an edge or a corner
+            place[axis] = rng.choice([-1, 1]) * (size[axis] + rng.uniform(-0.1, 0.35))
+        row[3:7] = rng.normal(size=4)
+        if k % 10 == 0:
+            mujoco.mju_mat2Quat(row[3:7], turn[:, rng.permutation(3)].ravel())
+        row[3:7] /= np.linalg.norm(row[3:7])
+        offset, ball = np.zeros(3), np.array([0.9, 0, 0])
+        mujoco.mju_rotVecQuat(offset, ball, row[3:7])
+        row[:3] = data.geom_xpos[0] + turn @ place - (k % 4 == 1) * offset  # every fourth: the sphere is there
+    return rows
+
+
+@compiled
+@pytest.mark.parametrize("size", [".5 .3 .2", ".1 .1 .1", "300 .5 .7"])
+def test_capsules_and_spheres_touch_a_box_as_in_c(size):
+    model = exact(mujoco.MjModel.from_xml_string(AT_A_BOX.format(size=size)))
+    made_of, rows = tables(model, 1, FORCES_OF_THE_FREE), at_a_box(model, 1000)
+    right = flat(made_of, by_c(model, rows, 0, FORCES_OF_THE_FREE))
+    assert (np.abs(right["read"]).max(axis=1) > 0).mean() > 0.3
+    found = by_threads(model, made_of, rows, whole=False)
+    turned = np.arange(len(rows)) % 10 != 0  # along the box's axes an edge or end may be the nearest by rounding alone
+    for name in ("warmstart", "read"):
+        wrong = errors(found[name], right[name])
+        assert wrong[turned].max() < 1e-6 and np.quantile(wrong[~turned], 0.9) < 1e-6
+    single = by_threads(model, made_of, rows, np.float32, whole=False)
+    assert np.quantile(errors(single["warmstart"], right["warmstart"])[turned], 0.97) < 2e-3
 
 
 # -- the order of elimination --
 
 
-@pytest.mark.parametrize("robot", [*FIRST, *FULL])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_every_dof_is_eliminated_once_and_after_those_on_it(robot):
     plan = threads.schedule(made(robot)[1])
     order = [d for dofs in plan.rounds for d in dofs]
@@ -293,6 +233,14 @@ def test_more_bodies_than_lanes_are_refused():
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     reason = threads.obstacle(tables(model, 1, {}))
     assert reason is not None and "33 moving bodies" in reason and "32" in reason
+
+
+def test_more_pairs_than_a_world_lists_are_refused():
+    balls = "".join(f"<body pos='{k} 0 0'><joint/><geom size='.1'/></body>" for k in range(16))
+    boxes = "".join(f"<geom type='box' size='.1 .1 .1' pos='{k} 9 0'/>" for k in range(260))
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{balls}{boxes}</worldbody></mujoco>")
+    reason = threads.obstacle(tables(model, 1, {}))
+    assert reason is not None and f"{16 * 15 // 2 + 16 * 260} pairs of geoms" in reason and "4096" in reason
 
 
 # -- PTX --
