@@ -135,6 +135,8 @@ def _help(parser: argparse.ArgumentParser) -> str:
 def all_tasks() -> str:
     """What agents of every task observe, the motors that they move, and the options of the task."""
     parts = ["# All tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
+    parts += [pages.as_tasks("all"), "`observation` and `state` count entries: of one agent's observation, and of what"]
+    parts[-1] += " central critics see. `action entries` counts those of one agent. `steps` is the time limit."
     for name in tasks.names():
         parts += [f"## {name} {{#{name}}}"]
         shown = {"Observation": "observation", "Global state": "state", "Actions": "actions", "Options": "options"}

@@ -344,20 +344,18 @@ def _pairs(reports: Reports) -> list[tuple[str, Found | None, str, Found | None]
 
 
 def alternatives(reports: Reports) -> str:
-    """Speed in a few rows, next to what one would use instead, and where and when each was measured."""
-    body, sources = [], dict[str, None]()
+    """Speed in a few rows, next to what one would use instead, and the results, whose own tables say where and when."""
+    body = []
     for what, ours, instead, theirs in _pairs(reports):
         if ours is None:
             continue
         used = [found for found in (ours, theirs) if found]
-        sources |= dict.fromkeys(found.result for found in used)
         figures = [f"{rate(found.row):,.0f}" for found in used]
         ratio = f"{statistics.median(ratios(ours.row, theirs.row)):.1f}" if theirs else ""
         names = ", ".join(f"`{name}`" for name in dict.fromkeys(found.result for found in used))
         body.append([what, figures[0], instead, *(figures[1:] or [""]), ratio, names])
     head = ("what", "here, per second", "instead", "per second", "ratio", "results")
-    notes = [f"* `{name}`: {' '.join(where(reports[name]).split())[:-1]}." for name in sources]
-    return markdown(head, body) + "\n\n" + "\n".join(notes)
+    return markdown(head, body)
 
 
 def limits(reports: Reports) -> str:
@@ -431,11 +429,6 @@ TABLES: dict[str, Callable[[Reports], str]] = {
             "steps per CPU-second",
             "of a plain loop on each core",
         ),
-    ),
-    "one_seed": Table(
-        "one_seed",
-        EVERY,
-        ("", SIZES, "devices", "environment steps/s", "of plain loops at once", "rollout, s", "update, s"),
     ),
     "methods": Table(
         "methods",

@@ -278,7 +278,6 @@ def test_the_readme_compares_the_newest_rows_and_names_their_results():
     }
     said = speed.TABLES["alternatives"](reports)
     assert "| 900 | MuJoCo-Warp | 100 | 9.0 | `ant_h100`, `ant_warp_h200` |" in said
-    assert "* `ant_h100`: 1 x NVIDIA H100, jax 1, commit abc, 2026-03-01." in said
     assert len([line for line in said.splitlines() if line.startswith("|")]) == 3  # what was not measured has no line
 
 
