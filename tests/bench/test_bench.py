@@ -252,6 +252,16 @@ def test_ratios_between_rows_are_taken_turn_by_turn():
     assert speed.COLUMNS["of a plain loop on each core"](five, [five]) == "-"
 
 
+@pytest.mark.parametrize("name", [name for name, each in speed.TABLES.items() if isinstance(each, speed.Table)])
+def test_every_column_shows_something(name: str):
+    """A column that is empty in each row of the stored results reads a name that they do not have."""
+    made = speed.TABLES[name](records.load())
+    heads = [[x.strip() for x in line.split("|")[1:-1]] for line in made.splitlines() if line.startswith("|")]
+    head, body = heads[0], [row for row in heads if row[0] != "---" and row != heads[0]]
+    empty = [column for i, column in enumerate(head) if column and {row[i] for row in body} <= {"-", ""}]
+    assert body and not empty
+
+
 def test_a_table_for_each_device_and_a_failure_in_it():
     row = {"kind": "environment", "task": "ant_2x4", "physics": "warp", "seeds": 1, "num_envs": 16_384}
     head = {"device": "NVIDIA H200", "versions": {"jax": "1"}}
