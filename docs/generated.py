@@ -11,6 +11,7 @@ import html
 import json
 import pathlib
 import re
+import sys
 import tomllib
 from collections.abc import Callable
 from typing import Any
@@ -20,8 +21,6 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from bench import records
-from bench.tables import pages, speed
 from pmt_jax import formats, tasks
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.flags import describe
@@ -36,7 +35,8 @@ ROOT = DOCS.parent
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The repository is that of pyproject.toml."""
+    """The repository is that of pyproject.toml; its folder is importable, as `bench` is not installed."""
+    sys.path.insert(0, str(ROOT))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     if repository := project.get("urls", {}).get("Repository"):
         config.repo_url, config.repo_name, config.edit_uri = repository, project["name"], "edit/main/docs/"
@@ -134,6 +134,8 @@ def _help(parser: argparse.ArgumentParser) -> str:
 
 def all_tasks() -> str:
     """What agents of every task observe, the motors that they move, and the options of the task."""
+    from bench.tables import pages
+
     parts = ["# All tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
     parts += [pages.as_tasks("all"), "`observation` and `state` count entries: of one agent's observation, and of what"]
     parts[-1] += " central critics see. `action entries` counts those of one agent. `steps` is the time limit."
@@ -147,6 +149,9 @@ def all_tasks() -> str:
 
 def pretrained() -> str:
     """The policies of the package with their evaluations, as `python -m bench publish` measured them."""
+    from bench import records
+    from bench.tables import speed
+
     table = speed.TABLES["hub"](records.load())
     head = (
         "Reward and cost of mean actions; [use a pretrained policy](../howto/pretrained.md) says what the columns mean."
