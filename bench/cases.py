@@ -148,6 +148,8 @@ ROBOTS = tuple(
     for name in ("ant_2x4", "half_cheetah_2x3", "hopper_3x1", "walker2d_2x3", "swimmer_2x1", "humanoid_9_8")
 )
 
+GOALS = tuple(f"multi_goal_{robot}_{level}" for robot in ("point", "ant") for level in range(3))
+
 BENCHES = {
     "ant": Bench(
         "ant: control steps/s of the environment alone per engine and size, next to plain loops",
@@ -180,7 +182,12 @@ BENCHES = {
     ),
     "walls": Bench(
         "ant: control steps/s of the environment alone, with walls that are drawn and with solid ones",
-        (*_walled("reference", physics="mujoco"), *_walled("solid", physics="mujoco")),
+        tuple(
+            case
+            for engine in ("fused", "mujoco")
+            for walls in ("reference", "solid")
+            for case in _walled(walls, physics=engine)
+        ),
         _walled("solid", physics="mujoco"),
     ),
     "hands": Bench(
@@ -211,6 +218,11 @@ BENCHES = {
             for task in ROBOTS
             for case in _alone(task, (16_384,), 50, physics=engine)
         ),
+    ),
+    "multi_goal": Bench(
+        "MultiGoal tasks: control steps/s of the environment alone next to plain loops with the forward pass",
+        tuple(case for task in GOALS for case in (_plain(task), *_alone(task, (64, 256), physics="mujoco"))),
+        (_plain("multi_goal_point_1"), *_alone("multi_goal_point_1", (64,), physics="mujoco")),
     ),
     "methods": Bench(
         "every method: seconds to compile and per update, steps/s of the whole training loop",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from typing import Any
 
 import numpy as np
@@ -63,14 +64,16 @@ def write(name: str, steps: dict[str, Any]) -> None:
     observation, action = (spaces.Box(-np.inf, np.inf, steps[key].shape[3:]) for key in ("obs", "action"))
     dataset = name.removeprefix(PREFIX)
     try:
-        create(
-            dataset,
-            episodes,
-            observation_space=observation,
-            action_space=action,
-            description="Episodes that pmt eval recorded (pmt-jax)",
-            data_format="hdf5",
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it misses an author and a gymnasium environment
+            create(
+                dataset,
+                episodes,
+                observation_space=observation,
+                action_space=action,
+                description="Episodes that pmt eval recorded (pmt-jax)",
+                data_format="hdf5",
+            )
     except OSError as error:
         paths = optional("minari.storage.datasets_root_dir", "minari")
         shutil.rmtree(paths.get_dataset_path(dataset), ignore_errors=True)

@@ -75,7 +75,8 @@ def check_memory(setup: Setup) -> None:
     """
     config, spec = setup.config, setup.vector.spec
     memory = device_memory() * (setup.mesh.size if setup.mesh else 1)
-    batch = config.batch_size * (spec.num_agents * spec.obs_dim + spec.state_dim)
+    observed = spec.num_agents * spec.obs_dim * (2 if setup.own_critics else 1)
+    batch = config.batch_size * (observed + spec.state_dim)
     widths = (spec.obs_dim, *config.hidden, spec.action_dim)
     networks = 3 * spec.num_agents * sum(x * y for x, y in itertools.pairwise(widths))
     for what, floats in (

@@ -88,6 +88,7 @@ METRICS: dict[str, Metric] = {
     "actor/clipped": Metric("", "share of rows whose weighted probability ratio is outside the clip interval"),
     "actor/kl_per_agent": Metric("nats", "KL(old, new) of an update, mean over the batch, agents and updates"),
     "actor/share_of_step": Metric("", "share of an update's step that `kl_max` kept"),
+    "actor/penalty": Metric("", "P3O's penalty before its weight, in an update's last epoch"),
     "actor/case": Metric("", "which case of the trust-region problem was solved"),
     "actor/reach": Metric("cost per step", "most that a step of the trust region promises to take off the cost"),
     "actor/line_search_steps": Metric("", "steps of the line search that were tried in vain"),

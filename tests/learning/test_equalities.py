@@ -13,7 +13,7 @@ import pytest
 
 from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_train
-from pmt_jax.learning import fear, learner, policies, regret, schedules
+from pmt_jax.learning import fear, policies, regret, schedules
 from pmt_jax.learning.types import LearnerState, Tag
 from small import SMALL, acted, differ, program, trained, weights
 
@@ -77,21 +77,22 @@ def test_critics_of_observations_see_nothing_of_other_agents():
 
 
 @pytest.mark.full
-def test_crpo_within_its_limit_is_happo_and_beyond_it_lowers_the_cost_alone(monkeypatch: pytest.MonkeyPatch):
+def test_crpo_within_its_limit_is_happo():
     within, metrics = trained("crpo", cost_limit=25.0)
     chex.assert_trees_all_close(weights(within)["actor"], weights(trained("happo")[0])["actor"], atol=1e-6)
     assert metrics["lambda"] == 0
-    made, seen = program("crpo"), {}
-    sampled = policies.policy_samples
-    monkeypatch.setattr(
-        learner, "policy_samples", lambda *each: seen.update(samples=sampled(*each), cost=each[5]) or seen["samples"]
-    )
-    start = made.init(made.setup.hyper, jax.random.key(0))
-    _, metrics = learner.train_step(made.setup, made.setup.hyper, start)
-    assert metrics["cost_excess"] > 0 and metrics["lambda"] == 1
-    cost = jnp.moveaxis(seen["cost"].reshape(-1, 2, 1), 1, 0)[..., 0]
-    expected = -(cost - cost.mean(1, keepdims=True)) / (cost.std(1, keepdims=True) + 1e-5)
-    np.testing.assert_allclose(seen["samples"].advantage, expected, rtol=1e-3, atol=1e-4)
+    beyond, metrics = trained("crpo", cost_limit=0.0)
+    assert metrics["lambda"] == 1 and differ(weights(beyond)["actor"], weights(within)["actor"])
+
+
+def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
+    setup, _, batch = acted()
+    setup = dataclasses.replace(setup, method=METHODS["crpo"])
+    reward, *cost = jax.random.normal(jax.random.key(2), (3, *batch.reward.shape))
+    none, chosen = jnp.zeros_like(batch.log_prob), jnp.asarray([[1.0], [0.0]])
+    rows = policies.policy_samples(setup, setup.hyper, chosen, batch, reward, jnp.stack(cost, -1)[..., None], none)
+    for advantage, expected in zip(rows.advantage, (-cost[0], reward), strict=True):
+        np.testing.assert_allclose(advantage, ((expected - expected.mean()) / expected.std()).ravel(), atol=1e-4)
 
 
 @pytest.mark.full
