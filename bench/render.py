@@ -5,7 +5,7 @@ bench/tables/speed.py makes of the results; whatever stood there before is repla
 table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
 `paper:FILE` for means and standard deviations next to the paper's, `summary:FILE+FILE` for methods by tasks,
 `overview:FILE+FILE` for tasks by methods with PID, `ran:FILE+FILE` for what has run, `pairs:FILE` for a test of each
-pair of methods. The studies' tables are in study.py and later_studies.py; those of tasks, settings and methods, as
+pair of methods. Tables of seldom noticed costs are in study.py; those of tasks, settings and methods, as
 `observation:ant_2x4`, in pages.py. In a sentence, `<!-- bench: within:FILE:METHOD:LIMIT -->18<!-- /bench -->` is a
 number, see values.py.
 """
@@ -21,14 +21,14 @@ from pmt_jax.files import replace_text
 from pmt_jax.tasks import did_you_mean
 
 from . import records
-from .tables import later_studies, pages, runs, study, values
+from .tables import pages, runs, study, values
 from .tables.speed import TABLES, Reports
 
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCK = re.compile(r"^(<!-- bench: (\S+) -->\n)(.*?)^(<!-- /bench -->)$", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"(<!-- bench: (\S+) -->)([^<`\n]*)(<!-- /bench -->)")
 MARK = re.compile(r"^<!-- (?:bench: \S+|/bench) -->$", re.MULTILINE)
-STORED = {**runs.KINDS, **study.KINDS, **later_studies.KINDS}
+STORED = {**runs.KINDS, **study.KINDS}
 
 
 def documents() -> list[pathlib.Path]:

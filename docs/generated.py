@@ -11,6 +11,7 @@ import html
 import json
 import pathlib
 import re
+import sys
 import tomllib
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +21,7 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from pmt_jax import formats
+from pmt_jax import formats, tasks
 from pmt_jax.cli.commands import make_parser
 from pmt_jax.cli.flags import describe
 from pmt_jax.config.fields import GROUPS
@@ -34,7 +35,8 @@ ROOT = DOCS.parent
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The repository is that of pyproject.toml."""
+    """The repository is that of pyproject.toml; its folder is importable, as `bench` is not installed."""
+    sys.path.insert(0, str(ROOT))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     if repository := project.get("urls", {}).get("Repository"):
         config.repo_url, config.repo_name, config.edit_uri = repository, project["name"], "edit/main/docs/"
@@ -130,6 +132,33 @@ def _help(parser: argparse.ArgumentParser) -> str:
     return f"```text\n{parser.format_help().strip()}\n```"
 
 
+def all_tasks() -> str:
+    """What agents of every task observe, the motors that they move, and the options of the task."""
+    from bench.tables import pages
+
+    parts = ["# All tasks", "What each agent observes and moves. [Tasks](../tasks/index.md) says what they are about."]
+    parts += [pages.as_tasks("all"), "`observation` and `state` count entries: of one agent's observation, and of what"]
+    parts[-1] += " central critics see. `action entries` counts those of one agent. `steps` is the time limit."
+    for name in tasks.names():
+        parts += [f"## {name} {{#{name}}}"]
+        shown = {"Observation": "observation", "Global state": "state", "Actions": "actions", "Options": "options"}
+        for title, kind in shown.items():
+            parts += [f"{title}:", pages.KINDS[kind](name)]
+    return "\n\n".join(parts)
+
+
+def pretrained() -> str:
+    """The policies of the package with their evaluations, as `python -m bench publish` measured them."""
+    from bench import records
+    from bench.tables import speed
+
+    table = speed.TABLES["hub"](records.load())
+    head = (
+        "Reward and cost of mean actions; [use a pretrained policy](../howto/pretrained.md) says what the columns mean."
+    )
+    return f"# Pretrained policies\n\n{head}\n\n{table}\n"
+
+
 def tutorial() -> str:
     """The notebook docs/tutorial.ipynb as a page."""
     cells = json.loads((DOCS / "tutorial.ipynb").read_text())["cells"]
@@ -154,6 +183,8 @@ PAGES: dict[str, Callable[[], str]] = {
     "reference/settings.md": settings,
     "reference/metrics.md": metrics,
     "reference/commands.md": commands,
+    "reference/tasks.md": all_tasks,
+    "reference/pretrained.md": pretrained,
     "design/contributing.md": from_the_top("CONTRIBUTING.md"),
     "palette.css": palette,
 }

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .learning.setup import make_setup
     from .policies.load import load_policy
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"  # the only place
 
 _PLACES = {
     "Config": "config.settings",

@@ -65,7 +65,9 @@ def as_options(name: str) -> str:
         words, _, text = entry.partition(": ")
         meaning |= dict.fromkeys(words.split(", "), " ".join(text.split()).rstrip("."))
     defaults = envs.task_options(name)
-    return markdown(("option", "default", "meaning"), ([f"`{x}`", _shown(defaults[x]), meaning[x]] for x in defaults))
+    return markdown(
+        ("option", "default", "meaning"), ([f"`{x}`", _shown(defaults[x]), meaning.get(x, "-")] for x in defaults)
+    )
 
 
 def _shown(default: Any) -> str:

@@ -203,7 +203,7 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "power flows/s": _rate_or_failure,
     "walls": _shown("{}", "what"),
     "of reference": _shown("{:.2f}", _of_reference_walls),
-    "worker processes": _shown("{}", "jobs"),
+    "worker processes": _shown("{}", "workers"),
     "steps per CPU-second": _shown("{:,}", "steps_per_cpu_second"),
     "of a plain loop on each core": _shown("{:.2f}", _of_plain_on_each_core),
     "of plain loops at once": _shown("{:.2f}", _of_as_many_loops),
@@ -212,7 +212,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "compile, s": _shown("{:.1f}", "compile_seconds"),
     "compile x MAPPO-L": _shown("{:.2f}", _compile_times_mappo_l),
     "update, s": _shown("{:.3f}", _update_seconds),
-    "rollout, s": _shown("{:.3f}", "rollout_seconds"),
     "update x MAPPO-L": _shown("{:.2f}", _times_mappo_l),
     "x one seed": _shown("{:.2f}", _times_one_seed),
     "efficiency": _shown("{:.2f}", _efficiency),
@@ -344,20 +343,18 @@ def _pairs(reports: Reports) -> list[tuple[str, Found | None, str, Found | None]
 
 
 def alternatives(reports: Reports) -> str:
-    """Speed in a few rows, next to what one would use instead, and where and when each was measured."""
-    body, sources = [], dict[str, None]()
+    """Speed in a few rows, next to what one would use instead, and the results, whose own tables say where and when."""
+    body = []
     for what, ours, instead, theirs in _pairs(reports):
         if ours is None:
             continue
         used = [found for found in (ours, theirs) if found]
-        sources |= dict.fromkeys(found.result for found in used)
         figures = [f"{rate(found.row):,.0f}" for found in used]
         ratio = f"{statistics.median(ratios(ours.row, theirs.row)):.1f}" if theirs else ""
         names = ", ".join(f"`{name}`" for name in dict.fromkeys(found.result for found in used))
         body.append([what, figures[0], instead, *(figures[1:] or [""]), ratio, names])
     head = ("what", "here, per second", "instead", "per second", "ratio", "results")
-    notes = [f"* `{name}`: {' '.join(where(reports[name]).split())[:-1]}." for name in sources]
-    return markdown(head, body) + "\n\n" + "\n".join(notes)
+    return markdown(head, body)
 
 
 def limits(reports: Reports) -> str:
@@ -431,11 +428,6 @@ TABLES: dict[str, Callable[[Reports], str]] = {
             "steps per CPU-second",
             "of a plain loop on each core",
         ),
-    ),
-    "one_seed": Table(
-        "one_seed",
-        EVERY,
-        ("", SIZES, "devices", "environment steps/s", "of plain loops at once", "rollout, s", "update, s"),
     ),
     "methods": Table(
         "methods",

@@ -1,6 +1,7 @@
 """Numbers in sentences: what stored runs say, as `within:FILE:METHOD:LIMIT`.
 
-FILE and METHOD may be several, joined by +, METHOD and LIMIT may be *, and any further word must be in a run's label.
+FILE and METHOD may be several, joined by +, METHOD and LIMIT may be *, and any further word must be in a run's label
+or be its task.
 The seeds of all these runs are pooled.
 """
 
@@ -39,7 +40,7 @@ def number(mark: str) -> str:
     stored = [run for name in files.split("+") for run in runs.load(records.RESULTS / f"{name}.json")]
     found = [run for run in stored if method == "*" or run["method"] in method.split("+")]
     found = [run for run in found if limit in ("*", f"{run['cost_limit']:g}")]
-    found = [run for run in found if set(words) <= set(run["label"].split())]
+    found = [run for run in found if set(words) <= {run["task"], *run["label"].split()}]
     if not found:
         raise UsageError(f"no run of {files} is '{':'.join(given[1:])}'")
     return VALUES[what]([runs.row_of(run) for run in found])

@@ -1,7 +1,7 @@
 """Where ants go: paths through the corridor of a few episodes of each policy, and a picture of them.
 
     python -m docs.figures.ant_paths                                draws all that is stored in bench/results
-    python -m docs.figures.ant_paths R4SG=hub:ant_2x4/r4sg runs/x   stores these as ant_paths.json and draws them
+    python -m docs.figures.ant_paths R4SG=hub:ant_2x4/r4sg runs/x   stores these, as ant_paths_methods.json, and draws
 
 Every episode is the seed's `last` policy from one of the fixed starts of evaluations, actions sampled. A run's first
 seed is shown; `NAME=FOLDER` gives a policy a title, `FOLDER@3` takes seed 3.
@@ -104,14 +104,14 @@ def main(words: list[str] | None = None) -> None:
     """Records the paths of the policies that are named, if any, and draws those that are stored."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policies", nargs="*", metavar="[TITLE=]RUN[@SEED]")
-    parser.add_argument("--json", type=pathlib.Path, help="where paths are stored (bench/results/ant_paths.json)")
+    parser.add_argument("--json", type=pathlib.Path, help="where paths are stored (ant_paths_methods.json)")
     parser.add_argument("--png", type=pathlib.Path, help="the picture (docs/NAME.png for NAME.json)")
     arguments = parser.parse_args(words)
     use_cache()
     try:
         if arguments.policies:
             found = [paths(source, EPISODES) for source in arguments.policies]
-            arguments.json = arguments.json or RESULTS / "ant_paths.json"
+            arguments.json = arguments.json or RESULTS / "ant_paths_methods.json"
             arguments.json.write_text(json.dumps(found) + "\n")
         for file in [arguments.json] if arguments.json else sorted(RESULTS.glob("ant_paths*.json")):
             draw(json.loads(file.read_text()), arguments.png or ROOT / "docs" / f"{file.stem}.png")

@@ -23,7 +23,7 @@ ROWS_PER_DAY = 24 * 60 // MINUTES
 KNOT_ROWS = 5  # rows between the 15-minute knots of measured and generated profiles
 FILES = ("load_active.csv", "load_reactive.csv", "pv_active.csv")
 # MW, largest sum of all loads. MAPDN's README states 3.5 and 20; these make the zero, random and droop policies reach
-# the figures that are published for the genuine data (docs/appendix/voltage.md has them side by side).
+# the figures that are published for the genuine data (docs/design/earlier.md says where they are side by side).
 PEAK_LOAD = {
     ("simbench", "case33"): 3.15,
     ("simbench", "case141"): 18.0,

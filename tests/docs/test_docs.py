@@ -109,9 +109,29 @@ def test_examples_in_docstrings(path: pathlib.Path):
     assert result.attempted and not result.failed
 
 
-def test_the_citation_is_of_this_version():
-    assert f"\nversion: {pmt_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f'\nversion = "{pmt_jax.__version__}"\n' in (ROOT / "pyproject.toml").read_text()
+def test_the_version_is_in_one_place():
+    """pmt_jax/__init__.py has it, and the changelog begins with it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "version" not in project["project"] and "version" in project["project"]["dynamic"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "pmt_jax.__version__"}
+    assert not re.search(r"^version:", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    first = re.search(r"^## (\S+)( \(unreleased\))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert first and pmt_jax.__version__ == first[1] + (".dev0" if first[2] else "")
+
+
+def test_hooks_are_the_checks_of_ci():
+    """A commit runs the linters, types and import rules that .ci/run does, in its words."""
+    hooks = re.findall(r"entry: ([^,}]+)", (ROOT / ".pre-commit-config.yaml").read_text())
+    ci = (ROOT / ".ci" / "run").read_text()
+    checks = re.search(r'step "linters, types, import rules"\n(.*?)\n\n', ci, re.DOTALL)
+    assert checks and [line.removesuffix(" .") for line in checks[1].splitlines()] == hooks
+
+
+def test_modules_of_python_are_stable_as_the_page_says():
+    """The names that the page on stability lists are those that the package exports."""
+    page = (ROOT / "docs" / "design" / "stability.md").read_text()
+    names = re.search(r"`from pmt_jax import \.\.\.`: ([^|]+)\|", page)
+    assert names and re.findall(r"`(\w+)`", names[1]) == sorted(pmt_jax.__all__, key=str.lower)
 
 
 @pytest.mark.full
