@@ -48,13 +48,18 @@ def state_of_the_user(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(autouse=True, scope="session")
-def cache_of_the_user():
+def cache_of_the_user(request: pytest.FixtureRequest):
     """What is compiled for `fused` is kept where JAX's programs are: for all processes of the tests, and the next time.
 
-    Its key has all that it is made of, so nothing stale is found.
+    Its key has all that it is made of, so nothing stale is found. With less optimisation it compiles in half the time;
+    processes that tests start, and `-m full`, have all of it.
     """
+    from envs.physics.fused import cpu
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(CACHE.parent))
+        if "not full" in request.config.getoption("markexpr"):
+            patch.setattr(cpu, "_FLAGS", ["-O1" if flag == "-O3" else flag for flag in cpu._FLAGS])
         yield
 
 
