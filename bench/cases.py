@@ -11,7 +11,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.tasks import did_you_mean
 
 Timed = Literal["plain loop", "environment", "training", "power flow"]
-Kind = Timed | Literal["start", "checkpoint", "baseline", "certificate"]
+Kind = Timed | Literal["start", "checkpoint", "baseline", "certificate", "update"]
 Settings = tuple[tuple[str, Any], ...]
 
 
@@ -119,6 +119,12 @@ def _in_workers(task: str, seeds: int, counts: Sequence[int]) -> tuple[Case, ...
     return tuple(dataclasses.replace(_training(task, "mappo_l", seeds, 64, 64), workers=count) for count in counts)
 
 
+def _fits(task: str, num_envs: int, length: int, *ways: str) -> tuple[Case, ...]:
+    """One step of the critic and of an actor, by XLA and by the learner's own code."""
+    sizes = {"method": "mappo_l", "num_envs": num_envs, "rollout_length": length}
+    return tuple(Case("update", task, f"{net} {way}", **sizes) for net in ("critic", "actor") for way in ways)
+
+
 def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tuple[Case, ...]:
     """One device; then per number D of devices D times the environments, D seeds, and what one device had."""
     cases = [_training(task, "mappo_l", 1, num_envs, length, what="one device")]
@@ -141,6 +147,8 @@ ROBOTS = tuple(
     f"velocity_{name}"
     for name in ("ant_2x4", "half_cheetah_2x3", "hopper_3x1", "walker2d_2x3", "swimmer_2x1", "humanoid_9_8")
 )
+
+GOALS = tuple(f"multi_goal_{robot}_{level}" for robot in ("point", "ant") for level in range(3))
 
 BENCHES = {
     "ant": Bench(
@@ -211,6 +219,11 @@ BENCHES = {
             for case in _alone(task, (16_384,), 50, physics=engine)
         ),
     ),
+    "multi_goal": Bench(
+        "MultiGoal tasks: control steps/s of the environment alone next to plain loops with the forward pass",
+        tuple(case for task in GOALS for case in (_plain(task), *_alone(task, (64, 256), physics="mujoco"))),
+        (_plain("multi_goal_point_1"), *_alone("multi_goal_point_1", (64,), physics="mujoco")),
+    ),
     "methods": Bench(
         "every method: seconds to compile and per update, steps/s of the whole training loop",
         (
@@ -218,6 +231,17 @@ BENCHES = {
             *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
+    ),
+    "update": Bench(
+        "one gradient step of a network: seconds by part, by XLA and by the learner's C++ code",
+        (*_fits("ant_2x4", 64, 64, "xla", "fused"), *_fits("ant_2x4", 256, 64, "xla", "fused")),
+        _fits("lane", 16, 16, "xla"),
+    ),
+    "update_gpu": Bench(
+        "GPU: one gradient step of a network: seconds and kernels by part",
+        (*_fits("ant_2x4", 2048, 8, "xla"), *_fits("ant_2x4", 384, 32, "xla")),
+        _fits("lane", 16, 16, "xla"),
+        on="gpu",
     ),
     "grid": Bench(
         "power flows/s next to other tools; environment steps/s in a scan and with a call a step",

@@ -27,7 +27,7 @@ from pmt_jax.learning.sharding import make_mesh
 from pmt_jax.training.compile import compile_run
 from pmt_jax.training.workers import start_workers
 
-from . import grid, once, plain
+from . import grid, once, plain, update
 from .cases import Build, Case, Program
 from .compare import label
 from .records import Record
@@ -179,6 +179,7 @@ ONCE = {
     "checkpoint": once.checkpoint,
     "baseline": once.baseline,
     "certificate": once.certificate,
+    "update": update.update,
 }
 MAKE = {"plain loop": plain.plain_loop, "environment": environment, "training": training, "power flow": grid.flow}
 

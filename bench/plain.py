@@ -22,6 +22,8 @@ import numpy as np
 
 from envs.ant import corridor
 from envs.hands import hand_over
+from envs.multi_goal import LEVELS, models
+from envs.multi_goal import VARIANTS as GOALS
 from envs.physics import usable_cpus
 from envs.velocity import VARIANTS, robots
 
@@ -82,8 +84,34 @@ def _velocity(name: str) -> Task:
     return Task(robots.model(name), robot.substeps, reset, over)
 
 
+def _multi_goal(variant: str) -> Task:
+    """Robots, and as many vases as the engine steps, anywhere on a grid; sensors need the forward pass."""
+    name, number = GOALS[variant]
+    kind, level = models.ROBOTS[name], LEVELS[number]
+    vases = min(level.vases, 4)
+    side = np.arange(-level.size + 0.25, level.size, 0.5)
+    cells = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    starts = [*range(0, 2 * kind.nq, kind.nq), *range(2 * kind.nq, 2 * kind.nq + 7 * vases, 7)]
+
+    def reset(data: mujoco.MjData, rng: np.random.Generator) -> None:
+        for start, place in zip(starts, rng.permutation(cells), strict=False):
+            data.qpos[start : start + 2] = place
+        if name == "ant":
+            for start in starts[:2]:
+                data.qpos[start + 2] = 0.18
+                data.qpos[start + 8 : start + 15 : 2] = np.array([1, -1, -1, 1]) * np.pi / 2
+
+    def over(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+        mujoco.mj_forward(model, data)
+        heights = data.qpos[2 : 2 * kind.nq : kind.nq]
+        return kind.least_height is not None and bool((heights <= kind.least_height).any())
+
+    return Task(models.model(name, 2, vases, level.size), models.SUBSTEPS, reset, over)
+
+
 TASKS: dict[str, Callable[[], Task]] = {
     **{f"velocity_{task}": functools.partial(_velocity, variant.robot) for task, variant in VARIANTS.items()},
+    **{f"multi_goal_{variant}": functools.partial(_multi_goal, variant) for variant in GOALS},
     "ant_2x4": lambda: Task(corridor.model(), corridor.SUBSTEPS, _reset_ant, _ant_over),
     "hand_over_2x6": lambda: Task(hand_over.model(), hand_over.SUBSTEPS, _reset_hands, _hands_over),
 }

@@ -128,11 +128,15 @@ Controller = Callable[[State], jax.Array]  # a state of one environment -> actio
 Raw = Callable[[State], dict[str, Any]]  # the quantities of a state that a picture reads, by name
 
 
+def _nothing(*_: Any) -> dict[str, Any]:  # a function of the module, so that tasks can be pickled
+    return {}
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plain:
     """No picture of its own: the task's `info` is drawn over time."""
 
-    raw: Raw = lambda state: {}
+    raw: Raw = _nothing
     kind: ClassVar[str] = "plain"
 
 
@@ -151,7 +155,7 @@ class Scene:
 
     raw: Raw
     model: Any
-    decorate: Callable[[Any, dict[str, np.ndarray], float], None] = lambda scene, raw, cost: None
+    decorate: Callable[[Any, dict[str, np.ndarray], float], object] = _nothing
     kind: ClassVar[str] = "scene"
 
 

@@ -42,7 +42,7 @@ def file_of(name: str) -> pathlib.Path:
 def _split(name: str) -> tuple[pathlib.Path, str | None]:
     match = _NAME.fullmatch(name)
     assert match is not None, name  # callers check `is_file` first
-    return pathlib.Path(match[1]).absolute(), match[2]
+    return pathlib.Path(match[1]).expanduser().absolute(), match[2]
 
 
 def absolute(name: str) -> str:
@@ -73,6 +73,18 @@ def factory(name: str) -> Callable[..., Env]:
         which = f"several ({listing}); choose one, as {file.name}:{envs[0].__name__}" if envs else "none"
         raise TaskError(f"{file} should hold one class with reset and step (see envs/base.py), but holds {which}")
     return envs[0]
+
+
+def members(name: str) -> tuple[dict[str, Any], str | None]:
+    """What the Python file that `name` means holds, by name, once it has been executed; and the `:Name`, if any.
+
+    Raises:
+      TaskError: there is no such file, or it cannot be imported.
+    """
+    file, chosen = _split(name)
+    if not file.is_file():
+        raise TaskError(f"there is no file {file}")
+    return vars(_module(file, file.stat().st_mtime_ns)), chosen
 
 
 class _Loader(importlib.machinery.SourceFileLoader):

@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
+from typing import TextIO
 
 from .errors import UsageError
 
@@ -21,7 +24,30 @@ def say(line: str) -> None:
     Line and newline are one write: threads that repeat what worker processes say would mix theirs otherwise.
     """
     with dropped_if_closed():
-        print(f"{line}\n", end="", flush=True)
+        print(f"{fitted(line, sys.stdout)}\n", end="", flush=True)
+
+
+def fitted(text: str, file: TextIO) -> str:
+    """`text` as it is printed: on a terminal, lines of prose that are too wide for it break between words.
+
+    Lines with columns (two spaces in a row) stay as they are, and so does all that goes into a pipe or a file.
+    """
+    try:
+        width = shutil.get_terminal_size().columns if file.isatty() else 0
+    except ValueError:  # it is closed
+        width = 0
+    if not width:
+        return text
+    return "\n".join(_broken(line, width) if len(line) > width else line for line in text.split("\n"))
+
+
+def _broken(line: str, width: int) -> str:
+    prose = line.lstrip()
+    if "  " in prose:
+        return line
+    indent = " " * (len(line) - len(prose))
+    wrapper = textwrap.TextWrapper(width, indent, f"{indent}  ", break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(prose)
 
 
 def result(text: str) -> None:

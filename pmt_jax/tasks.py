@@ -38,7 +38,9 @@ __all__ = [
     "observed_cost",
     "is_file",
     "make",
+    "members",
     "names",
+    "native",
     "options",
     "shares_cost",
     "task_file",
@@ -81,6 +83,19 @@ def is_file(name: str) -> bool:
 def task_file(name: str) -> pathlib.Path:
     """The Python file that a task's name means (see `is_file`), as a whole path; links are not followed."""
     return _envs().user.file_of(name)
+
+
+def members(name: str) -> tuple[dict[str, Any], str | None]:
+    """What the Python file that `name` means holds once it has been executed, and the `:Name` behind it, if any.
+
+    Raises:
+      UsageError: there is no such file, or it cannot be imported.
+    """
+    envs = _envs()
+    try:
+        return envs.user.members(name)
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from error
 
 
 def absolute(name: str) -> str:
@@ -153,6 +168,11 @@ def advice(env: Env) -> str | None:
 def compiler() -> str:
     """What compiles the engine `fused` here; needs one."""
     return importlib.import_module(f"{_envs().__name__}.physics.fused_engine").compiler()
+
+
+def native() -> types.ModuleType:
+    """How C++ code is compiled and called here."""
+    return importlib.import_module(f"{_envs().__name__}.native")
 
 
 def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:

@@ -1,4 +1,4 @@
-"""Which Python files of tasks may be executed: those whose content this user has run himself, or said to trust.
+"""Which Python files (tasks, methods) may be executed: those whose content this user has run, or said to trust.
 
 Whoever names a file on a command line wants it executed. A run folder, or a file of settings, may come from another
 person and name any file, so the files that it names are executed only if their digest is known. Digests are kept in
@@ -19,7 +19,7 @@ import pathlib
 from collections.abc import Iterable, Iterator
 
 from .errors import UsageError
-from .tasks import is_file, task_file
+from .tasks import absolute, is_file, task_file
 
 _OURS = ("envs", "pmt_jax")  # imported long before, so that no file next to a task's takes their place
 
@@ -36,20 +36,21 @@ def trusting(trust: bool = True) -> Iterator[None]:
         _trusts.reset(token)
 
 
-def check_source(source: str, tasks: Iterable[str]) -> None:
-    """What a command line names: a Python file becomes known; of a file of settings, the files that it names must be.
+def check_source(source: str, names: Iterable[str], methods: Iterable[str] = ()) -> None:
+    """What a command line names: Python files become known; of a file of settings, the files that it names must be.
 
     Args:
-      tasks: what `source` makes, as in a run's settings.
+      names: the tasks and methods that `source` makes, as in a run's settings.
+      methods: those that the command line names itself.
 
     Raises:
       UsageError: the settings name a Python file that is not known.
     """
-    if is_file(source):
-        remember(source)
-        return
+    own = [absolute(name) for name in (source, *methods) if is_file(name)]
+    for name in own:
+        remember(name)
     settings = pathlib.Path(source)
-    for task in dict.fromkeys(tasks):
+    for task in dict.fromkeys(name for name in names if name not in own):
         check(task, f"{source} names", settings.parent if settings.name == "config.toml" else None)
 
 

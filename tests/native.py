@@ -1,9 +1,9 @@
-"""What compiled physics needs on the machine that runs the tests."""
+"""What compiled code needs on the machine that runs the tests."""
 
 from __future__ import annotations
 
 import pytest
 
-from envs.physics.fused import cpu
+from envs import native
 
-compiled = pytest.mark.skipif(cpu.obstacle() is not None, reason="no C++ compiler here")
+compiled = pytest.mark.skipif(native.obstacle("fused") is not None, reason="no C++ compiler here")

@@ -16,7 +16,7 @@ from envs.physics.fused import model as tables_of
 from envs.velocity import robots
 
 ROBOTS = ("corridor", "hopper", "walls", "swimmer", "humanoid", "ant", "half_cheetah", "walker2d")
-THIN = ROBOTS[:2]  # in the default tests; `walls` is the corridor's ant beside solid walls
+THIN = ROBOTS[:2]  # in the default tests; `walls` is the corridor's ant next to solid walls
 Rows = dict[str, np.ndarray]  # qpos, qvel, warmstart, and the readouts by name
 
 

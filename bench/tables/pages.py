@@ -107,8 +107,10 @@ def as_switches(_: str) -> str:
     for name, method in METHODS.items():
         order = f"{method.order}, {'one shared actor' if method.share_actor else 'an actor each'}"
         cost = "-" if method.constraint == "none" else str(method.cost_signal)
-        body.append([f"`{name}`", order, method.constraint.replace("_", " "), cost, method.ratio_weight])
-    return markdown(("method", "update", "constraint", "cost signal", "ratio weight"), body)
+        rest = [method.ratio_weight, method.surrogate.replace("_", " "), method.critic]
+        body.append([f"`{name}`", order, method.constraint.replace("_", " "), cost, *rest])
+    columns = ("method", "update", "constraint", "cost signal", "ratio weight", "surrogate", "critics see")
+    return markdown(columns, body)
 
 
 KINDS: dict[str, Callable[[str], str]] = {

@@ -55,7 +55,7 @@ def advantages(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[jax.Arr
     key = jax.random.fold_in(state.key, state.update)
     now = schedules.at(setup.config, hyper, state.update)
     state, batch = learner.act(setup, hyper, state, {tag: jax.random.fold_in(key, tag) for tag in Tag})
-    values = critics.values(state.cost_critic, setup.nets.cost_value, batch)
+    values = critics.values(state.cost_critic, setup.nets.cost_value, critics.inputs(batch))
     zeros = (jnp.zeros_like(batch.cost), jnp.zeros_like(batch.cost))
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
 

@@ -25,6 +25,8 @@ from ..base import Env
 from ..errors import TaskError
 
 if TYPE_CHECKING:
+    from gymnasium.vector import AutoresetMode
+
     from .brax_env import BraxEnv
     from .from_brax_env import FromBrax
     from .gymnasium_vector import GymnasiumVector
@@ -34,25 +36,32 @@ if TYPE_CHECKING:
 __all__ = ["from_brax", "to_brax", "to_gymnasium", "to_jaxmarl", "to_pettingzoo"]
 
 
-def to_gymnasium(env: Env, num_envs: int, seed: int = 0) -> GymnasiumVector:
-    """`num_envs` copies of `env` as a `gymnasium.vector.VectorEnv` that resets in the same step.
+def to_gymnasium(
+    env: Env, num_envs: int, seed: int = 0, autoreset_mode: AutoresetMode | str = "SameStep"
+) -> GymnasiumVector:
+    """`num_envs` copies of `env` as a `gymnasium.vector.VectorEnv`.
 
     Observations are [num_envs, N, O] and actions [num_envs, N, A] in [-1, 1]; the reward is the team's. `info` holds
-    `cost` [num_envs, N, K], `global_state` [num_envs, S], the task's scalars, and `final_obs` if an episode ended.
+    `cost` [num_envs, N, K] of the step, `global_state` [num_envs, S] and the task's scalars. All arrays are copies.
 
     Args:
       seed: of the first episodes if `reset` names none.
+      autoreset_mode: when an episode that has ended begins anew. In the same step (`SameStep`), `info` then holds
+        `final_obs` and `final_info`, which has the last `global_state`, `cost` and scalars, for the environments of
+        `_final_obs`. Or in the next step (`NextStep`), which ignores that environment's action and has reward and cost
+        0, as gymnasium's wrappers with running statistics or other observations want it.
 
     Raises:
-      TaskError: gymnasium is not installed.
+      TaskError: gymnasium is not installed, `num_envs` is not 1 or more, or there is no such mode.
     """
-    return _adapter("gymnasium", "gymnasium_vector").GymnasiumVector(env, num_envs, seed)
+    return _adapter("gymnasium", "gymnasium_vector").GymnasiumVector(env, num_envs, seed, autoreset_mode)
 
 
 def to_pettingzoo(env: Env, seed: int = 0) -> PettingZooParallel:
     """`env` as a `pettingzoo.ParallelEnv`: agents `agent_0` ..., each with the actions it has (padding cut off).
 
-    Every agent gets the team's reward; its costs [K] are in `infos[agent]["cost"]`; `state()` is the global state.
+    Every agent gets the team's reward; its costs [K] are in `infos[agent]["cost"]`; `state()` is the global state. All
+    arrays are copies.
 
     Args:
       seed: of the first episode if `reset` names none.
@@ -81,7 +90,8 @@ def to_jaxmarl(env: Env) -> JaxMarlEnv:
 
     Every agent gets the team's reward. `infos` holds arrays [N]: `cost` (an agent's own, summed over K; of several also
     `cost/0` ...), `truncated`, and the task's own scalars. An episode ends for all agents, by the task's rule or its
-    time limit, and the next begins in the same step, as in JaxMARL. It is not a subclass: JaxMARL's trainers and
+    time limit, and the next begins in the same step, as in JaxMARL. `get_world_state(state)` is the global state, and
+    `get_last_world_state(state)` that of before a new episode. It is not a subclass: JaxMARL's trainers and
     `LogWrapper` need none.
 
     Example:

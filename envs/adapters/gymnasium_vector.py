@@ -2,59 +2,113 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ..base import Env
-from ..vector import VectorEnv
+from ..errors import TaskError, one_of
+from ..vector import Outcome, VectorEnv, VectorState
+from .arrays import action, boxes, count, key, owned
 
 Info = dict[str, Any]
+MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
 class GymnasiumVector(gymnasium.vector.VectorEnv):
     """See `adapters.to_gymnasium`."""
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-    def __init__(self, env: Env, num_envs: int, seed: int) -> None:
-        spec = env.spec
-        self.num_envs = num_envs
-        self.single_observation_space = Box(-np.inf, np.inf, (spec.num_agents, spec.obs_dim), np.float32)
-        self.single_action_space = Box(-1.0, 1.0, (spec.num_agents, spec.action_dim), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._vector = VectorEnv(env, num_envs)
-        self._reset, self._step = jax.jit(self._vector.reset), jax.jit(self._vector.step)
+    def __init__(self, env: Env, num_envs: int, seed: int, autoreset_mode: AutoresetMode | str) -> None:
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        self._mode = AutoresetMode(one_of("autoreset_mode", mode, [x.value for x in MODES]))
+        self.metadata = {"autoreset_mode": self._mode}
+        self.num_envs = count("num_envs", num_envs)
+        single = boxes(env)
+        self.single_observation_space, self.single_action_space = single["obs"], single["action"]
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._env = env
         self._np_random, self._np_random_seed = seeding.np_random(seed)
-        self._state: Any = None
+        self._state: VectorState | None = None
+        self._waiting = np.zeros(self.num_envs, bool)  # for a step that only shows the new episode
+        self._compile()
+
+    def _compile(self) -> None:
+        self._vector = VectorEnv(self._env, self.num_envs)
+        self._reset, self._step = jax.jit(self._vector.reset), jax.jit(functools.partial(_step, self._vector))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the programs, which the copy compiles anew."""
+        return {name: x for name, x in vars(self).items() if name not in ("_reset", "_step", "_vector")}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._compile()
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
-        """Fresh episodes everywhere; the same `seed` starts the same ones. The task has no `options`."""
-        del options
+        """Fresh episodes everywhere; the same `seed` starts the same ones. The task has no `options`.
+
+        Raises:
+          TaskError: `options` asks for some of the environments only.
+        """
+        if "reset_mask" in (options or {}):
+            raise TaskError("reset_mask cannot be had: episodes that end begin anew by themselves; reset without it")
         super().reset(seed=seed)
-        self._state = self._reset(jax.random.key(int(self.np_random.integers(2**31))))
-        return self._seen()
+        self._state = state = self._reset(key(self.np_random))
+        self._waiting[:] = False
+        start = owned(state.env)
+        return start.obs, {"global_state": start.global_state, "cost": start.cost, **start.info}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """One control step of all environments with `actions` [num_envs, N, A]; those that end start anew at once."""
-        self._state, outcome = self._step(self._state, np.asarray(actions, np.float32) * self._vector.spec.action_mask)
-        happened = jax.device_get(outcome)
-        done = happened.terminated | happened.truncated
-        obs, info = self._seen()
-        info |= {"cost": happened.cost, **happened.info}
-        if done.any():
-            info |= {"final_obs": happened.next_obs, "_final_obs": done}
-        return obs, happened.reward, happened.terminated, happened.truncated, info
+        """One control step of all environments with `actions` [num_envs, N, A].
 
-    def _seen(self) -> tuple[np.ndarray, Info]:
-        obs, state, cost, info = jax.device_get(
-            (self._state.env.obs, self._state.env.global_state, self._state.env.cost, self._state.env.info)
-        )
-        return obs, {"global_state": state, "cost": cost, **info}
+        Raises:
+          TaskError: there was no `reset` before, or `actions` has another shape.
+        """
+        if self._state is None:
+            raise TaskError("step was called before reset, which begins the first episodes; call reset() first")
+        joint = action(actions, self.action_space, "actions") * self._vector.spec.action_mask
+        self._state, happened, start = self._step(self._state, self._waiting, joint)
+        happened, start = owned(happened), owned(start)
+        done = happened.terminated | happened.truncated
+        info = {"cost": happened.cost, **happened.info}
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._waiting = done
+            shown, state = happened.next_obs, happened.next_global_state
+        else:
+            shown, state = start.obs, start.global_state
+            if done.any():
+                last = {"global_state": happened.next_global_state, **owned(info)}
+                each = last | {f"_{name}": done.copy() for name in last}
+                info |= {"final_obs": happened.next_obs, "_final_obs": done.copy()}
+                info |= {"final_info": each, "_final_info": done.copy()}
+        info["global_state"] = state
+        return shown, happened.reward, happened.terminated, happened.truncated, info
+
+
+def _step(
+    vector: VectorEnv, state: VectorState, waiting: jax.Array, action: jax.Array
+) -> tuple[VectorState, Outcome, Any]:
+    """A step of the environments that are not `waiting` [B]; the others only show where their new episode begins.
+
+    Returns:
+      the state; what happened; and the State from which the next step starts.
+    """
+    after, outcome = vector.step(state, action)
+    begun, nothing = state.env, jnp.zeros(vector.num_envs, bool)
+    shown = Outcome(
+        begun.reward, begun.cost, begun.info, nothing, nothing, begun.obs, begun.global_state, nothing, nothing
+    )
+
+    def where_waiting(x: Any, y: Any) -> Any:
+        return jax.vmap(lambda yes, x, y: jax.tree.map(functools.partial(jnp.where, yes), x, y))(waiting, x, y)
+
+    after = where_waiting(state, after)
+    return after, where_waiting(shown, outcome), after.env

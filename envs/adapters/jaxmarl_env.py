@@ -35,6 +35,24 @@ class Box:
         return jnp.all((x >= self.low) & (x <= self.high))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class JaxMarlState(VectorState):
+    """An environment at the moment before its next action, and what its last step led to before any new episode.
+
+    Attributes:
+      last_obs: [1, N, O]; last_global_state: [1, S].
+    """
+
+    last_obs: jax.Array
+    last_global_state: jax.Array
+
+    @classmethod
+    def of(cls, state: VectorState, obs: jax.Array, global_state: jax.Array) -> JaxMarlState:
+        """`state`, which a step led to by way of these."""
+        return cls(**vars(state), last_obs=obs, last_global_state=global_state)
+
+
 class JaxMarlEnv:
     """See `adapters.to_jaxmarl`."""
 
@@ -67,15 +85,15 @@ class JaxMarlEnv:
         """`agent`'s actions: its own entries, each in [-1, 1]."""
         return self.action_spaces[agent]
 
-    def reset(self, key: jax.Array) -> tuple[ByAgent, VectorState]:
+    def reset(self, key: jax.Array) -> tuple[ByAgent, JaxMarlState]:
         """The start of an episode drawn with `key`, a typed key or a raw one [2]."""
         typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
         state = self._vector.reset(key if typed else jax.random.wrap_key_data(key))
-        return self.get_obs(state), state
+        return self.get_obs(state), JaxMarlState.of(state, state.env.obs, state.env.global_state)
 
     def step(
-        self, key: jax.Array, state: VectorState, actions: ByAgent, reset_state: VectorState | None = None
-    ) -> tuple[ByAgent, VectorState, ByAgent, ByAgent, ByAgent]:
+        self, key: jax.Array, state: JaxMarlState, actions: ByAgent, reset_state: JaxMarlState | None = None
+    ) -> tuple[ByAgent, JaxMarlState, ByAgent, ByAgent, ByAgent]:
         """One control step; if an episode ends, a new one begins, drawn with the state's own key or `reset_state`.
 
         Returns:
@@ -85,11 +103,13 @@ class JaxMarlEnv:
         joint = jnp.zeros((1, *self._vector.spec.action_mask.shape))
         for i, (agent, entries) in enumerate(zip(self.agents, self._entries, strict=True)):
             joint = joint.at[0, i, entries].set(actions[agent][: len(entries)])
-        after, outcome = self._vector.step(state, joint)
+        after, outcome = self._vector.step(_plain(state), joint)
+        after = JaxMarlState.of(after, outcome.next_obs, outcome.next_global_state)
         happened = jax.tree.map(lambda x: x[0], outcome)
         done = happened.terminated | happened.truncated
         if reset_state is not None:
-            after = jax.tree.map(lambda x, y: jnp.where(done, x, y), reset_state, after)
+            begun = JaxMarlState.of(_plain(reset_state), after.last_obs, after.last_global_state)
+            after = jax.tree.map(lambda x, y: jnp.where(done, x, y), begun, after)
         each = {"truncated": happened.truncated, **happened.info}
         infos = {name: jnp.broadcast_to(x, (self.num_agents,)) for name, x in each.items()}
         infos["cost"] = happened.cost.sum(-1)
@@ -101,3 +121,24 @@ class JaxMarlEnv:
     def get_obs(self, state: VectorState) -> ByAgent:
         """Every agent's observation [O]."""
         return dict(zip(self.agents, state.env.obs[0], strict=True))
+
+    def world_state_size(self) -> int:
+        """S, the length of the global state."""
+        return self._vector.spec.state_dim
+
+    def get_world_state(self, state: VectorState) -> jax.Array:
+        """The global state [S], for centralised critics."""
+        return state.env.global_state[0]
+
+    def get_last_obs(self, state: JaxMarlState) -> ByAgent:
+        """Every agent's observation [O] after the last step; where an episode ended there, its last one."""
+        return dict(zip(self.agents, state.last_obs[0], strict=True))
+
+    def get_last_world_state(self, state: JaxMarlState) -> jax.Array:
+        """The global state [S] after the last step; where an episode ended there, its last one: a critic bootstraps
+        from it at a time limit."""
+        return state.last_global_state[0]
+
+
+def _plain(state: VectorState) -> VectorState:
+    return VectorState(state.env, state.elapsed, state.episode, state.key)

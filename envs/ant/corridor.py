@@ -18,6 +18,7 @@ Examples:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -29,7 +30,7 @@ from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, agent_index, joints, length, motors
 from ..errors import TaskError, one_of, typed
 from ..partition import evenly, parse
-from ..physics import PhysicsState, make_engine
+from ..physics import PhysicsState, kernels_of, make_engine
 from .walls import DANGER, FOLDS, HALF_WIDTH, SLOPE, WALLS, model
 
 SUBSTEPS = 5  # integration steps of 0.01 s in a control step
@@ -140,7 +141,7 @@ class AntCorridor:
             actions=tuple(tuple(names[motor] for motor in group) for group in self._partition.groups),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
-            kernels=getattr(self._engine, "kernels", tuple),
+            kernels=functools.partial(kernels_of, self._engine),
         )
         self.spec = EnvSpec(
             name=f"ant_{self._partition.name}",

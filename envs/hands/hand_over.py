@@ -40,7 +40,7 @@ import numpy as np
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, Blocks, length, motors
 from ..errors import one_of, typed
-from ..physics import PhysicsState, make_engine, resolve
+from ..physics import PhysicsState, kernels_of, make_engine, resolve
 
 MODEL = Path(__file__).parent / "hand_over.xml"
 SUBSTEPS = 2  # integration steps of 1/120 s in a control step
@@ -212,7 +212,7 @@ class HandOver:
             actions=_motors(self.model, mask),
             picture=Scene(self.raw, self.model, self.decorate),
             overflow="physics_overflow",
-            kernels=getattr(self._engine, "kernels", tuple),
+            kernels=functools.partial(kernels_of, self._engine),
         )
         self.spec = EnvSpec(
             name=f"hand_over_{variant}",

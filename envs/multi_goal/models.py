@@ -90,8 +90,7 @@ def model(robot: str, robots: int, vases: int, size: float) -> mujoco.MjModel:
         arena.attach(child, prefix=f"{i}/", frame=arena.worldbody.add_frame())
     for v in range(vases):
         _add_vase(arena, v)
-    height = 2.5 * size
-    arena.worldbody.add_camera(name="above", pos=[0, 0, height], quat=[1, 0, 0, 0], fovy=48)
+    arena.worldbody.add_camera(name="above", pos=[0, 0, 2.5 * size], quat=[1, 0, 0, 0], fovy=48)
     return arena.compile()
 
 

@@ -37,7 +37,7 @@ import numpy as np
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, Blocks, agent_index, length
 from ..errors import TaskError, at_least, one_of, typed
-from ..physics import PhysicsState, make_engine
+from ..physics import PhysicsState, kernels_of, make_engine
 from . import LEVELS, VARIANTS
 from .baselines import policies
 from .groups import groups_of, touched_robots, touched_vases
@@ -191,6 +191,7 @@ class MultiGoal:
             picture=Scene(self._drawn, self.model, self.decorate),
             baselines=policies(self),
             overflow="physics_overflow",
+            kernels=functools.partial(kernels_of, self._engine, self._at_rest),
         )
         num_costs = len(self.charges) if self._by_kind else 1
         self.spec = EnvSpec(

@@ -1,4 +1,4 @@
-"""What a picture shows beside robots and vases: goals, hazards, who pays, and what a robot's lidar sees of hazards."""
+"""What a picture shows besides robots and vases: goals, hazards, who pays, and what a robot's lidar sees of hazards."""
 
 # mujoco is a binary module without stubs:
 # pyright: reportAttributeAccessIssue=false

@@ -36,7 +36,7 @@ class Vases:
         return physics.qvel[self.nv :].reshape(self.count, 6)
 
     def choose(self, physics: PhysicsState, robots: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The vases [K] to simulate, beside robots at [N, 2] m, and how many [] more would move or be touched."""
+        """The vases [K] to simulate, next to robots at [N, 2] m, and how many [] more would move or be touched."""
         place = self.qpos(physics)[:, :2]
         nearest = jnp.sqrt(jnp.sum((place[:, None] - robots) ** 2, axis=2)).min(1)
         moving = (jnp.abs(self.qvel(physics)) > MOVING).any(1)

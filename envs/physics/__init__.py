@@ -25,7 +25,8 @@ Examples:
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ..errors import TaskError
 from .contract import (
@@ -52,6 +53,7 @@ __all__ = [
     "advice",
     "check_versions",
     "explain",
+    "kernels_of",
     "make_engine",
     "obstacle",
     "resolve",
@@ -90,7 +92,7 @@ def make_engine(
     model = copy.copy(model)
     # Each engine's module is imported when it is first built: warp needs packages that the others do without.
     if chosen == "fused":
-        from .fused.cpu import NoLibrary
+        from ..native import NoLibrary
         from .fused_engine import FusedEngine
 
         try:
@@ -110,3 +112,8 @@ def make_engine(
     from .mjx_engine import MjxEngine
 
     return MjxEngine(model, substeps, readout, forward)
+
+
+def kernels_of(*engines: Engine) -> list[Callable[[], Any]]:
+    """What engines need compiled besides XLA's programs, as calls for any threads; only warp needs some."""
+    return [kernel for engine in engines for kernel in getattr(engine, "kernels", tuple)()]

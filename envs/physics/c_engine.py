@@ -21,13 +21,13 @@ import mujoco
 import numpy as np
 
 from ..errors import at_least
-from .contract import PhysicsState, Readout, needs_post_constraint, rest_state, usable_cpus
+from .contract import PhysicsState, Readout, Remade, needs_post_constraint, rest_state, usable_cpus
 from .host_call import GivenUp, host_call, register
 from .native_batch import BatchSteps, forget_batches
 from .thread_team import TeamSteps, after_step, forget_threads
 
 
-class CEngine:
+class CEngine(Remade):
     """MuJoCo's C engine on threads, called from inside the jitted program once per control step.
 
     The numbers depend on neither the number of threads nor which of them advances which environment.

@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 
+from .. import native
 from ..errors import TaskError, one_of
 from ..versions import installed_version
 
@@ -41,6 +43,19 @@ def check_versions() -> None:
 
 
 check_versions()
+
+
+class Remade:
+    """What is pickled as the arguments that it was made of, as it holds programs, threads or pointers."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        made = super().__new__(cls)
+        made._made_of = args, kwargs
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        args, kwargs = self._made_of
+        return functools.partial(type(self), *args, **kwargs), ()
 
 
 @jax.tree_util.register_dataclass
@@ -136,9 +151,7 @@ def _fused_obstacle(
     if reason:
         return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
     if on_cpu:
-        from .fused import cpu  # with its compilers, only if it is asked for
-
-        return cpu.obstacle()
+        return native.obstacle("fused")
     from .fused import nvrtc
 
     return nvrtc.obstacle()

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import native
 from ..errors import at_least
 from .batching import flattened
-from .contract import PhysicsState, Readout, rest_state, usable_cpus
+from .contract import PhysicsState, Readout, Remade, rest_state, usable_cpus
 from .fused import cpu, gpu
 from .fused.model import FIELDS, tables
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-class FusedEngine:
+class FusedEngine(Remade):
     """See the module. The numbers depend on neither the number of threads nor the rest of a batch.
 
     Raises:
@@ -76,4 +77,4 @@ class FusedEngine:
 
 def compiler() -> str:
     """What compiles the step for this process's devices."""
-    return cpu.describe() if jax.default_backend() == "cpu" else "compiled by NVRTC"
+    return native.describe() if jax.default_backend() == "cpu" else "compiled by NVRTC"

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from .contract import PhysicsState, Readout, needs_post_constraint, rest_state
+from .contract import PhysicsState, Readout, Remade, needs_post_constraint, rest_state
 from .mjx_patches import check_hooks, import_mjx, patched
 
 
-class MjxEngine:
+class MjxEngine(Remade):
     """MJX: pure XLA, any device, the same numbers run after run (on CPU and TPU)."""
 
     name = "mjx"

@@ -17,11 +17,11 @@ import numpy as np
 
 from . import warp_kernels
 from .batching import flattened
-from .contract import PhysicsState, Readout, needs_post_constraint, rest_state
+from .contract import PhysicsState, Readout, Remade, needs_post_constraint, rest_state
 from .mjx_patches import import_mjx
 
 
-class WarpEngine:
+class WarpEngine(Remade):
     """MuJoCo-Warp, whose kernels of a whole control step are one CUDA graph.
 
     MJX would make a foreign call of every substep and hand all of MuJoCo's arrays from one to the next. Here these

@@ -28,6 +28,7 @@ Examples:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -38,7 +39,7 @@ import numpy as np
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, Blocks, agent_index, joints, length, motors
 from ..errors import TaskError, one_of, typed
-from ..physics import PhysicsState, Readout, make_engine
+from ..physics import PhysicsState, Readout, kernels_of, make_engine
 from . import VARIANTS, Partition
 from .kinematics import make_kinematics
 from .robots import ROBOTS, model
@@ -124,7 +125,7 @@ class Velocity:
             actions=tuple(tuple(names[motor] for motor in agent) for agent in partition),
             picture=Scene(self._drawn, self.model, self.decorate),
             overflow="physics_overflow",
-            kernels=getattr(self._engine, "kernels", tuple),
+            kernels=functools.partial(kernels_of, self._engine),
         )
         self.spec = EnvSpec(
             name=f"velocity_{variant}",

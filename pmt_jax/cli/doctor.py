@@ -23,6 +23,8 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-che
 EXTRAS = {  # which of our extras brings an optional package
     "warp-lang": "warp",
     "imageio-ffmpeg": "render",
+    "onnxruntime": "onnx",
+    "minari": "minari",
     "gymnasium": "adapters",
     "pettingzoo": "adapters",
     "brax": "adapters",

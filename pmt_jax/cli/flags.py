@@ -11,9 +11,10 @@ from ..config.fields import GROUPS
 from ..config.load import expectation, load_config
 from ..config.methods import METHODS
 from ..config.settings import FIELDS, Config
-from .parser import HELP
+from .parser import HELP, path
 
 _METAVARS = {int: "N", float: "X"}
+_PATHS = ("init", "init_fear")
 _PREFIX = "set_"  # of the names under which argparse keeps settings
 
 
@@ -42,7 +43,8 @@ def add_settings(parser: argparse.ArgumentParser) -> dict[str, argparse._Argumen
 def given(arguments: argparse.Namespace) -> dict[str, Any]:
     """The settings that the command line names."""
     pairs = vars(arguments).items()
-    return {name.removeprefix(_PREFIX): x for name, x in pairs if name.startswith(_PREFIX) and x is not None}
+    found = {name.removeprefix(_PREFIX): x for name, x in pairs if name.startswith(_PREFIX) and x is not None}
+    return found | {name: str(path(x)) for name, x in found.items() if name in _PATHS and x}
 
 
 class _Help(argparse.Action):
@@ -70,7 +72,7 @@ class _Help(argparse.Action):
 
 def describe(field: dataclasses.Field[Any], config: Config) -> tuple[str, str]:
     """Which values a setting takes, in words, and the one that it has in `config`, as one would type it."""
-    words = " | ".join(METHODS) if field.name == "method" else expectation(FIELDS[field.name])
+    words = " | ".join([*METHODS, "my_methods.py:NAME"]) if field.name == "method" else expectation(FIELDS[field.name])
     return words, _shown(getattr(config, field.name))
 
 

@@ -84,6 +84,14 @@ def whole(least: int, most: int = INT32_MAX) -> Callable[[str], int]:
     return read
 
 
+def path(text: str) -> pathlib.Path:
+    """The type of a path; a `~` that the shell left, as in --out=~/runs, is the home."""
+    try:
+        return pathlib.Path(text).expanduser()
+    except RuntimeError:
+        raise argparse.ArgumentTypeError(f"must be a path, but '{text}' begins with a home that is unknown") from None
+
+
 def span(text: str) -> slice:
     """The type of FROM:TO or FROM:TO:EVERY, each part a whole number or nothing."""
     parts = text.split(":")
@@ -171,4 +179,4 @@ def add_seed(parser: Any) -> None:
 def add_out(parser: Any, default: str) -> None:
     """-o."""
     out = pathlib.Path(default)
-    parser.add_argument("-o", "--out", type=pathlib.Path, default=out, metavar="FILE", help=f"(default {default})")
+    parser.add_argument("-o", "--out", type=path, default=out, metavar="FILE", help=f"(default {default})")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import pathlib
 from typing import Any
 
 from .. import numerics
 from ..output import say
-from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, pixels, span, whole
+from .parser import RUN, add_deterministic, add_out, add_seed, add_trust, command, path, pixels, span, whole
 from .process import interruptible
 
 
@@ -21,7 +20,7 @@ def add(commands: Any) -> None:
         "play an episode of a run: pmt render runs/x -o x.html (or .gif, .mp4)",
         description="Plays one episode and writes it as a film, or as a page that replays it in any browser.",
     )
-    render.add_argument("run_folder", metavar="RUN", type=pathlib.Path, help=RUN)
+    render.add_argument("run_folder", metavar="RUN", type=path, help=RUN)
     add_out(render, "replay.html")
     add_seed(render)
     render.add_argument(
@@ -47,7 +46,7 @@ def add(commands: Any) -> None:
         description="Reward, cost, violations, multiplier and emotions over training; runs that differ in nothing but "
         "their seeds make one curve: the mean over seeds, in a band from the lowest to the highest.",
     )
-    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    plot.add_argument("run_folders", metavar="RUN", nargs="+", type=path, help="run folders")
     add_out(plot, "curves.png")
 
     report = command(
@@ -57,7 +56,7 @@ def add(commands: Any) -> None:
         "everything about runs on one page: pmt report runs/* -o report.html",
         description="Settings, versions, curves, an evaluation with intervals and a replay, in one file.",
     )
-    report.add_argument("run_folders", metavar="RUN", nargs="+", type=pathlib.Path, help="run folders")
+    report.add_argument("run_folders", metavar="RUN", nargs="+", type=path, help="run folders")
     add_out(report, "report.html")
     report.add_argument(
         "--episodes", type=whole(1), default=32, metavar="N", help="of the evaluation, per seed (default 32)"

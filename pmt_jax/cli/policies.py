@@ -12,7 +12,7 @@ from ..config.load import convert
 from ..errors import UsageError
 from ..files import to_stderr
 from ..output import result, say
-from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, whole
+from .parser import RUN, add_deterministic, add_seed, add_trust, add_which, command, path, whole
 from .process import interruptible
 
 
@@ -34,11 +34,12 @@ def add(commands: Any) -> None:
     add_trust(evaluation)
     evaluation.add_argument(
         "--save",
-        type=pathlib.Path,
-        metavar="FILE.npz",
-        help="also write every step of S seeds, E episodes, T steps and N agents: seed [S], length [S, E], "
-        "obs [S, E, T, N, O], action [S, E, T, N, A], reward [S, E, T]; cost and true_cost [S, E, T, N, K]; "
-        "terminated, truncated and info/NAME [S, E, T]; 0 after the end of an episode",
+        type=path,
+        metavar="FILE.npz|minari:NAME-v0",
+        help="also write every step of S seeds, E episodes, T steps and N agents, as a Minari data set or as arrays: "
+        "seed [S], length [S, E], obs [S, E, T, N, O], final_obs [S, E, N, O], action [S, E, T, N, A], "
+        "reward [S, E, T]; cost and true_cost [S, E, T, N, K]; terminated, truncated and info/NAME [S, E, T]; "
+        "0 after the end of an episode",
     )
     evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
 
@@ -49,8 +50,9 @@ def add(commands: Any) -> None:
         "write a trained policy as files: pmt export runs/x -o policy",
         description="Writes policy.stablehlo (jax.export), policy.npz (weights) and numpy_policy.py (their loader).",
     )
-    export.add_argument("source", metavar="RUN", type=pathlib.Path, help=RUN)
-    export.add_argument("-o", "--out", type=pathlib.Path, required=True, metavar="DIR", help="the folder to write")
+    export.add_argument("source", metavar="RUN", type=path, help=RUN)
+    export.add_argument("-o", "--out", type=path, required=True, metavar="DIR", help="the folder to write")
+    export.add_argument("--onnx", action="store_true", help="also policy.onnx; needs pip install 'pmt-jax[onnx]'")
     add_seed(export)
     add_which(export)
     add_trust(export)
@@ -114,9 +116,20 @@ def run_export(arguments: argparse.Namespace) -> int:
         from ..trust import trusting
 
     with trusting(arguments.trust):
-        export_policy(arguments.source, arguments.out, arguments.seed, arguments.which or "last")
-    say(f"wrote policy.stablehlo, policy.npz and numpy_policy.py into {arguments.out}")
+        chosen = (arguments.seed, arguments.which or "last")
+        *names, last = export_policy(arguments.source, arguments.out, *chosen, onnx=arguments.onnx)
+    say(f"wrote {', '.join(names)} and {last} into {arguments.out}")
     return 0
+
+
+def _is_within(facts: dict[str, Any]) -> bool:
+    """Whether the mean costs of a pretrained policy, of each agent and cost, are within its limit."""
+    from ..training.metrics import judged_cost
+
+    means = {name: mean for name, (mean, _) in facts["figures"].items()}
+    limits = {name: x for name, x in facts.items() if name.startswith("cost_limit")}
+    cost, limit = judged_cost(means | limits, "")
+    return cost <= limit
 
 
 @interruptible()
@@ -126,7 +139,10 @@ def run_hub(arguments: argparse.Namespace) -> int:
     from ..limits import WORST
     from ..policies import hub
 
-    result("mean actions, per episode; +- half-width of the 95 % interval over episodes (docs/howto/pretrained.md)")
+    result(
+        "mean actions, per episode; +- half-width of the 95 % interval over episodes; training: reward / cost with "
+        "noise, the last tenth of the steps (docs/howto/pretrained.md)"
+    )
     width = max(map(len, hub.names()), default=0)
     for name in hub.names():
         try:
@@ -135,6 +151,10 @@ def run_hub(arguments: argparse.Namespace) -> int:
             to_stderr(f"left out: {error}")
             continue
         figures, limit = facts["figures"], f"limit {facts['cost_limit']:g}"
+        limit += ", within" if _is_within(facts) else ", beyond"
+        if trained := facts.get("trained"):
+            kept = "within" if trained["within"] else "beyond"
+            limit += f"; training {trained['episode_reward']:.2f} / {trained['episode_cost']:.2f}, {kept}"
         reward, rewards = figures["episode_reward"]
         cost, costs = figures.get(f"episode_cost{WORST}", figures["episode_cost"])
         result(f"{name:{width}} reward {reward:9.2f} +- {rewards:<7.2f} cost {cost:7.2f} +- {costs:<6.2f} {limit}")

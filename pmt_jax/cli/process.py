@@ -84,7 +84,7 @@ def _refuse(name: str, sentence: str) -> int:
 def _print(name: str, sentence: str) -> None:
     """Prints a sentence that is no result, control characters escaped."""
     shown = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in sentence)
-    print(f"{name}: {shown}", file=sys.stderr)
+    print(output.fitted(f"{name}: {shown}", sys.stderr), file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 from ..errors import UsageError
 from ..output import check_written, result, say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
-from .parser import SOURCE, add_format, add_jobs, add_trust, command, whole
+from .parser import SOURCE, add_format, add_jobs, add_trust, command, path, whole
 from .process import interruptible, refuse_many
 
 
@@ -44,7 +45,13 @@ def _add_sweep(commands: Any) -> None:
     )
     sweep.add_argument("--random", type=whole(0), default=0, metavar="N", help="draw N values from each range of --set")
     sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="seed of these draws (default 0)")
-    sweep.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR", help="gets a run folder per point")
+    sweep.add_argument("--out", type=path, required=True, metavar="DIR", help="gets a run folder per point")
+    sweep.add_argument(
+        "--part",
+        metavar="I/N",
+        help="train share I of N of the programs; N such commands, also on several hosts that share DIR, finish the "
+        "sweep (in a SLURM job array the task's own share; 1/1 for all)",
+    )
     add_jobs(sweep)
     add_trust(sweep)
     add_settings(sweep)
@@ -58,7 +65,7 @@ def _add_table(commands: Any) -> None:
         "compare runs with intervals over seeds, next to the paper's numbers: pmt table runs/*",
         description="One row per task, method and settings: interquartile means with 95 % intervals.",
     )
-    table.add_argument("sources", nargs="+", type=pathlib.Path, metavar="RUN", help="run folders, or folders of them")
+    table.add_argument("sources", nargs="+", type=path, metavar="RUN", help="run folders, or folders of them")
     table.add_argument("--baseline", metavar="METHOD", help="also show the probability of improvement over this row")
     table.add_argument(
         "--test",
@@ -66,9 +73,7 @@ def _add_table(commands: Any) -> None:
         help="also print p values against the baseline: Mann-Whitney U, Holm's correction",
     )
     add_format(table)
-    table.add_argument(
-        "-o", dest="output", type=pathlib.Path, metavar="FILE", help="write the table to this file instead"
-    )
+    table.add_argument("-o", dest="output", type=path, metavar="FILE", help="write the table to this file instead")
 
 
 def _add_compare(commands: Any) -> None:
@@ -82,10 +87,8 @@ def _add_compare(commands: Any) -> None:
     )
     for name in ("first", "second"):
         run = "a run folder, or a folder of runs that differ only in their seeds"
-        compare.add_argument(name, metavar="RUN", type=pathlib.Path, help=run)
-    compare.add_argument(
-        "-o", "--out", type=pathlib.Path, metavar="FILE", help="also draw the curves: .png, .svg, .pdf"
-    )
+        compare.add_argument(name, metavar="RUN", type=path, help=run)
+    compare.add_argument("-o", "--out", type=path, metavar="FILE", help="also draw the curves: .png, .svg, .pdf")
 
 
 def _add_reproduce(commands: Any) -> None:
@@ -104,7 +107,7 @@ def _add_reproduce(commands: Any) -> None:
         help="smoke (default): minutes, to see that everything runs | paper: 5 seeds, all steps; days on a CPU",
     )
     reproduce.add_argument(
-        "--out", type=pathlib.Path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
+        "--out", type=path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
     )
     add_jobs(reproduce)
     add_format(reproduce)
@@ -124,15 +127,26 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     points = make_points(parts, arguments.preset, **given(arguments))
     refuse_many("pmt sweep", arguments.jobs, arguments.devices)
     from ..policies.load import check_trusted
-    from ..studies import sweep
+    from ..studies import shares, sweep
 
     with trusting(arguments.trust):
-        check_source(source, [config.task for config in points.values()])
+        named = [name for config in points.values() for name in (config.task, config.method)]
+        check_source(source, named, [arguments.set_method or "", *_methods(words)])
         for run in {run for config in points.values() for run in (config.init, config.init_fear) if run}:
             check_trusted(pathlib.Path(run))  # here, because worker processes do not ask again
-        code = sweep.sweep(parts, points, arguments.out, _launch(arguments))
+        if share := shares.read(arguments.part) if arguments.part else shares.of_array():
+            if arguments.jobs > 1:
+                raise UsageError("--part trains one program at a time; start more parts instead of --jobs")
+            code = shares.train(share, parts, points, arguments.out, _launch(arguments))
+        else:
+            code = sweep.sweep(parts, points, arguments.out, _launch(arguments))
     check_written()
     return code
+
+
+def _methods(words: Sequence[str]) -> list[str]:
+    """The methods that `--set method=...` names."""
+    return [name for word in words if word.startswith("method=") for name in word.removeprefix("method=").split(",")]
 
 
 def _launch(arguments: argparse.Namespace) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import pathlib
 import sys
 from typing import Any
 
@@ -14,7 +13,7 @@ from ..errors import UsageError
 from ..output import say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
-from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, whole
+from .parser import SOURCE, add_cache, add_devices, add_trust, command, names, path, whole
 from .process import check_system, interruptible
 
 
@@ -31,7 +30,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("source", metavar="TASK|CONFIG", help=SOURCE)
     output = add_settings(parser)["output"]
-    output.add_argument("--out", type=pathlib.Path, metavar="DIR", help="the run folder (default: a new one in runs/)")
+    output.add_argument("--out", type=path, metavar="DIR", help="the run folder (default: a new one in runs/)")
     output.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     output.add_argument(
         "--change", action="store_true", help="with --resume: continue with settings other than those of the run"
@@ -43,7 +42,7 @@ def add(commands: Any) -> None:
         metavar="NAMES",
         help="metrics also go to any of csv, tensorboard, wandb",
     )
-    output.add_argument("--profile", type=pathlib.Path, metavar="DIR", help="JAX profiler trace of a few chunks")
+    output.add_argument("--profile", type=path, metavar="DIR", help="JAX profiler trace of a few chunks")
     output.add_argument(
         "--debug", action="store_true", help="stop at the first number that is not finite and name its tensor; slower"
     )
@@ -73,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise UsageError("--resume needs --out, the folder of the run to continue")
         if arguments.change and not arguments.resume:
             raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
-        check_source(arguments.source, [config.task])
+        check_source(arguments.source, [config.task, config.method], [arguments.set_method or ""])
         if arguments.verbose:
             logging.getLogger("envs").setLevel(logging.INFO)
         if sys.stdout.isatty():
@@ -81,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         check_system()
         numerics.check_settings()
         from ..policies import warm_start
+        from ..studies import verdict
         from ..training import processes, trainer
 
         processes.join(arguments.coordinator, arguments.process, arguments.processes, arguments.devices)
@@ -98,4 +98,5 @@ def run(arguments: argparse.Namespace) -> int:
             warm_start=warm_start.prepare,
             debug=arguments.debug,
             change=arguments.change,
+            conclude=verdict.lines,
         )

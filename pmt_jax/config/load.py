@@ -18,7 +18,7 @@ import tomli_w
 
 from ..errors import UsageError
 from ..tasks import absolute, did_you_mean, is_file
-from .methods import METHODS
+from . import methods
 from .settings import FIELDS, Config
 
 _PACKAGE = pathlib.Path(__file__).parents[1]
@@ -41,7 +41,8 @@ def load_config(
     Args:
       source: a name in configs/ (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
         a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
-      method: a name in METHODS; the file's own choice if None.
+      method: a name in METHODS, or a Python file with a row of your own (`my_methods.py:dread`); the file's own choice
+        if None.
       preset: a file of configs/presets.
       **overrides: any field of Config.
 
@@ -57,8 +58,7 @@ def load_config(
     own = table.get("method")
     if method is None:
         method = own if isinstance(own, str) else str(Config.method)
-    if method not in METHODS:
-        raise UsageError(f"unknown method '{method}'{did_you_mean(method, METHODS)}")
+    method = methods.known(method)
     layers = [_for_method(source, table, method), _for_method(preset, read_preset(preset), method), overrides]
     values = {name: value for layer in layers for name, value in layer.items()}
     if "env" in values:
@@ -87,8 +87,7 @@ def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) 
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
         raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
     for name in tables:
-        if name not in METHODS:
-            raise UsageError(f"unknown method '{name}'{did_you_mean(name, METHODS)}")
+        methods.known(name)
     return shared | tables.get(method, {})
 
 

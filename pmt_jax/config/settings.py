@@ -136,7 +136,7 @@ class Hyper:
         "PID: weight of the excess's rise since the last update, added as well",
         NOT_NEGATIVE,
     )
-    lambda_max: float = constraint(20.0, "upper bound of the multiplier", NOT_NEGATIVE)
+    lambda_max: float = constraint(20.0, "upper bound of the multiplier, and P3O's weight of the penalty", NOT_NEGATIVE)
     surrogate_weight: float = constraint(
         1.0,
         "weight of the mean of ratio * cost advantage in the multiplier's step; nan means rollout_length, which "
@@ -186,7 +186,9 @@ class Hyper:
         "what a step of the first kl_limit could; above 1 more steps only lower the cost as kl_half_life shortens them",
         POSITIVE_OR_INF,
     )
-    kl_limit: float = constraint(0.01, "size of MACPO's trust region, mean KL in nats", POSITIVE)
+    kl_limit: float = constraint(
+        0.01, "size of MACPO's trust region, mean KL in nats, and FOCOPS's bound on the KL of each sample", POSITIVE
+    )
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
     first_step: float = constraint(1.0, "first step of MACPO's line search, as a share of the full step", NOT_NEGATIVE)
     step_decay: float = constraint(0.8, "factor between one step of the line search and the next", NOT_NEGATIVE)

@@ -27,7 +27,7 @@ def init(setup: Setup, hyper: Hyper) -> Constraint:
     heads = (setup.vector.spec.num_agents, setup.vector.spec.num_costs)
     return Constraint(
         estimate=jnp.full(heads, target(hyper)),
-        multiplier=jnp.full(heads, hyper.lambda_init * (setup.method.constraint == "lagrangian")),
+        multiplier=jnp.full(heads, hyper.lambda_init * (setup.method.constraint in ("lagrangian", "pid"))),
         lowered=jnp.zeros(heads),
     )
 
@@ -105,7 +105,9 @@ def price(setup: Setup, hyper: Hyper, multiplier: jax.Array, excess: jax.Array, 
     Args:
       multiplier: [N, K]; excess: [N, K] of this update, in cost per step; estimate: [N, K] of the update before.
     """
-    if setup.method.constraint != "lagrangian":
+    if setup.method.constraint == "switching":
+        return switching(excess)
+    if setup.method.constraint not in ("lagrangian", "pid"):
         return multiplier
     previous = cost_excess(estimate, target(hyper), setup.vector.horizon)
     now, before = (excess_in_lambda_unit(setup, hyper, x) for x in (excess, previous))
@@ -132,6 +134,44 @@ def pid(
     return jnp.clip(integral + lambda_kp * excess + lambda_kd * change, 0.0, lambda_max)
 
 
+def switching(excess: jax.Array) -> jax.Array:
+    """CRPO's choice of what an agent improves [N, K]: 1 at its cost furthest beyond the limit, else 0 (reward).
+
+    Algorithm 1 of Xu et al. (2021): while an estimate is beyond its limit an update lowers that cost alone, and
+    otherwise it raises the reward alone. The paper's tolerance is a `cost_margin` below 0 there; here it is at least 0.
+
+    Args:
+      excess: [N, K], S of this update, in any unit that costs share.
+    """
+    worst = jax.nn.one_hot(excess.argmax(-1), excess.shape[-1])
+    return worst * (excess > 0)
+
+
+def weights(setup: Setup, price: jax.Array) -> tuple[jax.Array | float, jax.Array]:
+    """What the reward [N] and each cost [N, K] count in the policies' loss, of what the costs' `price` [N, K] is.
+
+    `pid`: 1 / (1 + lambda) and lambda / (1 + lambda), so that the step keeps its size however high the multiplier is
+    (Stooke et al., 2020, Algorithm 1). `switching`: 1 for the one that is improved. Else 1 and the price.
+    """
+    paid = price.sum(-1)
+    if setup.method.constraint == "pid":
+        return 1 / (1 + paid), price / (1 + paid)[:, None]
+    return (1 - paid if setup.method.constraint == "switching" else 1.0), price
+
+
+def integrate(setup: Setup, hyper: Hyper, constraint: Constraint, excess: jax.Array) -> Constraint:
+    """The constraint before the policies change: `pid` adds this update's excess [N, K] to its integral first.
+
+    I <- (I + K_I S)_+, with K_I = `lambda_lr`, then lambda = (I + K_P S + K_D (S - S_previous)_+)_+ is the price of
+    this update (Stooke et al., 2020, Algorithm 2), both of them at most `lambda_max`.
+    """
+    if setup.method.constraint != "pid":
+        return constraint
+    step = excess_in_lambda_unit(setup, hyper, excess)
+    updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
+    return dataclasses.replace(constraint, multiplier=updated)
+
+
 def respond(
     setup: Setup,
     hyper: Hyper,
@@ -148,11 +188,11 @@ def respond(
       samples: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
       reach: [] cost per step, the most that a step of the trust region promised to take off the cost.
     """
-    if setup.method.constraint == "none":
-        return constraint
     if setup.method.constraint == "trust_region":
         lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, now.limit_windup * reach)
         return dataclasses.replace(constraint, lowered=lowered)
+    if setup.method.constraint != "lagrangian":
+        return constraint
     surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
     step = excess_in_lambda_unit(setup, hyper, excess + hyper.surrogate_weight * surrogate)
     if setup.config.lambda_unit == "relative":

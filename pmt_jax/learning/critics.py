@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .maths import running_moments
 from .maths.losses import value_loss
-from .optimise import fit
+from .optimise import Loss, fit
 from .rollout import flatten_steps
 from .schedules import Schedule
 from .setup import Setup
@@ -18,9 +18,14 @@ from .types import Batch, Critic, Hyper, Metrics, Params
 ValueFn = Callable[[Params, jax.Array], jax.Array]
 
 
-def values(critic: Critic, value_fn: ValueFn, batch: Batch) -> tuple[jax.Array, jax.Array]:
-    """Values of the states and of the true next states [T, B, ...], in the signal's unit."""
-    both = value_fn(critic.net.params, jnp.stack([batch.state, batch.next_state]))
+def inputs(batch: Batch) -> tuple[jax.Array, jax.Array]:
+    """What critics see and see next: states [T, B, S], or each agent's own observations [T, B, N, O] (IPPO)."""
+    return (batch.state, batch.next_state) if batch.next_obs is None else (batch.obs, batch.next_obs)
+
+
+def values(critic: Critic, value_fn: ValueFn, seen: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Values of what critics see and of what they see next [T, B, ...] (see `inputs`), in the signal's unit."""
+    both = value_fn(critic.net.params, jnp.stack(seen))
     value, next_value = running_moments.denormalise(critic.returns, both)
     return value, next_value
 
@@ -39,18 +44,26 @@ def fit_critic(
 
     Args:
       clip: half-width of the interval of values, in those units.
-      samples: states [T, B, S], values when they were collected and returns, both [T, B, ...] in the signal's unit.
+      samples: what the critic sees, states [T, B, S] or observations [T, B, N, O]; values when they were collected and
+        returns, both [T, B, ...] in the signal's unit.
     """
     state, old_value, returns = samples
     moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
     normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
+    loss = loss_of(value_fn, clip)
+    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
+    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
+    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
+
+
+def loss_of(value_fn: ValueFn, clip: jax.Array | float) -> Loss:
+    """The mean of `value_loss` over rows of states, old values and targets, these in normalised units."""
+
     def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, old, target = minibatch
         return value_loss(value_fn(params, state), old, target, clip).mean(), {}
 
-    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
-    net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
-    unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
-    return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
+    return loss

@@ -89,8 +89,8 @@ def play(
       what the costs were before `observe`), non_finite and cost_out_of_range (steps of the episode that were not
       finite, or had a cost outside [0, 1]), each agent's and cost's episode_cost/... and true_episode_cost/... (see
       `limits.columns`), and the task's info (means over the episode), each [episodes]; all undiscounted. With `record`
-      also `step/NAME` [horizon, episodes, ...]: obs (before the action), action, reward, cost as observed, true_cost,
-      terminated, truncated, info/NAME; 0 after an episode's end.
+      also `step/NAME` [horizon, episodes, ...]: obs (before the action), next_obs (before any reset), action, reward,
+      cost as observed, true_cost, terminated, truncated, info/NAME; 0 after an episode's end.
     """
     return _play(env, act, episodes, observe, fresh, record)[0]
 
@@ -156,6 +156,7 @@ def _recorded(
     """What `play` keeps of one step of all environments, 0 where an episode has ended."""
     kept = {
         "obs": obs,
+        "next_obs": outcome.next_obs,
         "action": action,
         "reward": outcome.reward,
         "cost": observed,

@@ -86,7 +86,10 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
     heads = (spec.num_agents, spec.num_costs)
     return LearnerState(
         actor=jax.vmap(init_train_state)(setup.nets.init_actor(tagged[Tag.ACTOR])),
-        critic=Critic(init_train_state(setup.nets.init_critic(tagged[Tag.CRITIC])), running_moments.init(())),
+        critic=Critic(
+            init_train_state(setup.nets.init_critic(tagged[Tag.CRITIC])),
+            running_moments.init((spec.num_agents,) if setup.own_critics else ()),
+        ),
         cost_critic=Critic(
             init_train_state(setup.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), running_moments.init(heads)
         ),
@@ -109,6 +112,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
 
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
+    setup = dataclasses.replace(setup, nets=setup.nets.fast)
     key = jax.random.fold_in(state.key, state.update)
     tagged = {tag: jax.random.fold_in(key, tag) for tag in Tag}
     now = schedules.at(setup.config, hyper, state.update)
@@ -123,24 +127,24 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     )
 
     # 3 Advantages of reward and of danger.
-    value, next_value = critics.values(state.critic, setup.nets.value, batch)
-    cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, batch)
+    seen = critics.inputs(batch)
+    value, next_value = critics.values(state.critic, setup.nets.value, seen)
+    cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
-    advantage, returns = gae(batch.reward, value, next_value, *ends)
+    reward = batch.reward[..., None] if setup.own_critics else batch.reward
+    advantage, returns = gae(reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.
-    held = state.constraint
-    horizon = setup.vector.horizon
-    estimate = constraint.estimate_cost(
-        setup.config.cost_estimate, horizon, batch, held.estimate, cost_value, hyper.gamma
-    )
+    horizon, previous = setup.vector.horizon, state.constraint.estimate
+    estimate = constraint.estimate_cost(setup.config.cost_estimate, horizon, batch, previous, cost_value, hyper.gamma)
     excess = constraint.cost_excess(estimate, constraint.target(hyper), horizon)
-    price = partial(constraint.price, setup, hyper, excess=excess, estimate=held.estimate)
+    price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
+    held = constraint.integrate(setup, hyper, state.constraint, excess)
     actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
-    samples, cost_samples = (batch.state, value, returns), (batch.state, cost_value, cost_returns)
+    samples, cost_samples = (seen[0], value, returns), (seen[0], cost_value, cost_returns)
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
@@ -191,6 +195,7 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
         tagged[Tag.ACTION],
         setup.config.rollout_length,
         observe,
+        setup.own_critics,
     )
     moments = (
         running_moments.accumulate(state.obs_moments, obs),

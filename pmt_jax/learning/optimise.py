@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from . import sharding
+from . import fused, sharding
 from .types import Metrics, Params, TrainState
 
 ADAM_EPS = 1e-5
@@ -57,6 +57,7 @@ def fit(
     Returns:
       The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
+    kernel = fused.available() and fused.takes(net.params)
     count = jax.tree.leaves(rows)[0].shape[0]
     shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
@@ -64,6 +65,9 @@ def fit(
         # Said in the scan: what is said before it does not reach all rows, and devices then exchange some at each step.
         minibatch = sharding.shard(jax.tree.map(lambda x: x[index], sharding.replicate(rows)))
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
+        if kernel:
+            params, opt_state, norm = fused.adam(net.params, net.opt_state, gradient, learning_rate, max_grad_norm)
+            return TrainState(params, opt_state), {"loss": value, "grad_norm": norm, **metrics}
         norm = optax.tree.norm(gradient)
         shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
         direction, opt_state = _ADAM.update(jax.tree.map(lambda g: g * shrink, gradient), net.opt_state)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from . import sharding
-from .constraint import respond
+from .constraint import respond, weights
 from .maths import distributions
 from .maths.advantages import standardise
-from .maths.losses import clipped_surrogate, hybrid_advantage
-from .optimise import fit
+from .maths.losses import clipped_penalty, clipped_surrogate, first_order_surrogate, hybrid_advantage
+from .optimise import Loss, fit
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_steps
@@ -56,13 +56,16 @@ def policy_samples(
     """The batch as every agent's policy sees it, leaves [N, R, ...].
 
     Args:
-      price: [N, K], what a cost counts; advantage: [T, B]; cost_advantage: [T, B, N, K]; log_weight: [T, B, N].
+      price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of observations; cost_advantage:
+        [T, B, N, K]; log_weight: [T, B, N].
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
     if setup.config.regret_response == "advantage":
         scaled, log_weight = scaled * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
-    hybrid = hybrid_advantage(advantage[..., None], scaled, price)
+    reward_weight, cost_weight = weights(setup, price)
+    each = advantage.reshape(*advantage.shape[:2], -1)
+    hybrid = hybrid_advantage(each * reward_weight, scaled, cost_weight)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
     samples = PolicySamples(
@@ -154,36 +157,67 @@ def update_policy(
     """One policy's step on its samples [R, ...].
 
     Args:
-      violation: [K] cost per step, how far the costs are beyond what a trust region is to keep, its lowered limit.
+      violation: [K] cost per step, how far the costs are beyond what the policy is to keep, a lowered limit.
 
     Returns:
       the network; [] cost per step, the most that a trust region's step promised to take off the cost, else 0; metrics.
     """
     if setup.method.constraint == "trust_region":
         return trust_region_steps(setup, hyper, now, net, samples, violation, key)
-    net, metrics = _clipped_epochs(setup, hyper, now, net, samples, key)
+    net, metrics = _epochs(setup, hyper, now, net, samples, violation, key)
     return net, jnp.zeros(()), metrics
 
 
-def _clipped_epochs(
-    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, samples: PolicySamples, key: jax.Array
+def _epochs(
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    net: TrainState,
+    samples: PolicySamples,
+    violation: jax.Array,
+    key: jax.Array,
 ) -> tuple[TrainState, Metrics]:
-    """Epochs of clipped policy gradient (PPO)."""
+    """Epochs of policy gradient (PPO)."""
+    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
+    limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
+    loss = policy_loss(setup, hyper, now, samples, violation)
+    new, metrics = fit(net, loss, samples, key, **limits, **passes)
+    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, samples)
+    return TrainState(params, new.opt_state), metrics
+
+
+def policy_loss(
+    setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySamples, violation: jax.Array | float
+) -> Loss:
+    """What epochs minimise, of one policy's weights and a minibatch of `samples`: the method's surrogate and penalty.
+
+    Args:
+      violation: see `update_policy`; only a penalty reads it.
+    """
+    penalised = setup.method.constraint == "penalty"
+    scale = jnp.maximum(samples.cost_advantage.std(0) + 1e-5, hyper.cost_std_floor) if penalised else 1.0
 
     def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
         mean, std = setup.nets.policy(params, samples.obs)
         log_ratio = distributions.log_prob(samples.action, mean, std, samples.mask) - samples.log_prob
-        gain = clipped_surrogate(log_ratio, samples.log_weight, samples.advantage, samples.factor, hyper.clip)
+        ratios = (log_ratio, samples.log_weight)
+        if setup.method.surrogate == "first_order":
+            kl = distributions.kl(mean, std, samples.mean, samples.std, samples.mask)
+            gain = first_order_surrogate(*ratios, samples.advantage, samples.factor, kl, now.kl_limit)
+        else:
+            gain = clipped_surrogate(*ratios, samples.advantage, samples.factor, hyper.clip)
         entropy = distributions.entropy(std, samples.mask).mean()
         outside = jnp.abs(jnp.exp(log_ratio + samples.log_weight) - 1) > hyper.clip
         deviation = (std * samples.mask).sum() / samples.mask.sum()
         metrics = {"entropy": entropy, "clipped": outside.mean(), "std": deviation}
-        return -gain.mean() - hyper.entropy_coef * entropy, metrics
+        total = -gain.mean() - hyper.entropy_coef * entropy
+        if penalised:
+            costs = samples.cost_advantage / scale
+            metrics["penalty"] = clipped_penalty(*ratios, costs, samples.factor, violation / scale, hyper.clip)
+            total += hyper.lambda_max * metrics["penalty"]
+        return total, metrics
 
-    passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
-    new, metrics = fit(net, loss, samples, key, learning_rate=now.actor_lr, max_grad_norm=hyper.max_grad_norm, **passes)
-    params, metrics["share_of_step"] = _limit_kl(setup, now.kl_max, net.params, new.params, samples)
-    return TrainState(params, new.opt_state), metrics
+    return loss
 
 
 def _limit_kl(

@@ -52,6 +52,7 @@ def collect(
     key: jax.Array,
     steps: int,
     observe: ObserveCost = lambda cost, t: cost,
+    keep_next_obs: bool = False,
 ) -> tuple[RolloutState, Batch, tuple[jax.Array, jax.Array]]:
     """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
 
@@ -59,6 +60,7 @@ def collect(
       policy: of normalised observations.
       normalise: for observations and for global states.
       observe: what of a step's cost the learner observes; all of it by default.
+      keep_next_obs: the batch has them, for critics of observations.
 
     Returns:
       the state to continue from, the batch [T, B, ...], and the raw observations and states [T, B, ...] seen.
@@ -91,6 +93,7 @@ def collect(
             "next_state": normalise_state(outcome.next_global_state),
             "cost": observed,
             "whole": state.vector.elapsed == state.length,
+            "next_obs": normalise_obs(outcome.next_obs) if keep_next_obs else None,
         }
         return _clear_finished(sums, outcome), (_record(seen, outcome, sums), (env.obs, env.global_state))
 
@@ -98,7 +101,7 @@ def collect(
     return state, batch, raw
 
 
-def _record(seen: dict[str, jax.Array], outcome: Outcome, sums: RolloutState) -> Batch:
+def _record(seen: dict[str, jax.Array | None], outcome: Outcome, sums: RolloutState) -> Batch:
     return Batch(
         **seen,
         reward=outcome.reward,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import numerics, tasks
-from ..config.methods import METHODS, Method
+from ..config.methods import Method, find
 from ..config.settings import HYPER_FIELDS, Config, Hyper
 from ..errors import UsageError
 from ..limits import Limits
@@ -64,6 +64,11 @@ class Setup:
         return [Limits(tuple(one)) for one in np.broadcast_to(each, (self.config.seeds, count)).tolist()]
 
     @property
+    def own_critics(self) -> bool:
+        """Whether critics see each agent's own observation in place of the state."""
+        return self.method.critic == "observation"
+
+    @property
     def shares_cost(self) -> bool:
         """Whether the task declares that each step costs all its agents the same."""
         return tasks.shares_cost(self.vector.env)
@@ -112,13 +117,13 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     """
     if found := numerics.obstacle():
         raise UsageError(found)
-    method = METHODS[config.method]
+    method = find(config.method)
     if env is None:
         env = tasks.make(config.task, config.physics, **dict(config.env))
     else:
         tasks.check(env)
     _check_limits(config, env.spec)
-    nets = networks.build(config, env.spec, method.share_actor)
+    nets = networks.build(config, env.spec, method)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
     return Setup(config, method, vector, nets)
 

@@ -111,19 +111,19 @@ def gather(tree: Any) -> Any:
 
 def per_device(function: F) -> F:
     """`function` of pytrees with a leading [B], applied on each device to its own part of the environments."""
-    if _single_device():
+    if single_device():
         return function
     return jax.shard_map(function, in_specs=P(ENV), out_specs=P(ENV), check_vma=False)
 
 
 def shard(tree: Any) -> Any:
     """Each device works on its part of the rows, the leaves' first axis."""
-    return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P(ENV))
+    return tree if single_device() else jax.lax.with_sharding_constraint(tree, P(ENV))
 
 
 def replicate(tree: Any) -> Any:
     """Every device has all of it: what is drawn from at random is gathered once, not once a draw."""
-    return tree if _single_device() else jax.lax.with_sharding_constraint(tree, P())
+    return tree if single_device() else jax.lax.with_sharding_constraint(tree, P())
 
 
 def in_parallel(*parts: functools.partial[Any]) -> tuple[Any, ...]:
@@ -132,7 +132,7 @@ def in_parallel(*parts: functools.partial[Any]) -> tuple[Any, ...]:
     Devices of a CPU take whole parts, the first ones the first device: it computes the gradient of a small minibatch
     faster than its devices exchange their shares of it. Other devices share the rows of every part.
     """
-    devices = 1 if _single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
+    devices = 1 if single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
     if devices == 1 or not _takes_whole_parts():
         return tuple(part() for part in parts)
     leaves, structure = jax.tree.flatten([(part.args, part.keywords) for part in parts])
@@ -160,7 +160,7 @@ def _takes_whole_parts() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def _single_device() -> bool:
+def single_device() -> bool:
     """Whether there is no mesh, or what is traced is one device's own."""
     mesh = jax.sharding.get_abstract_mesh()
     return mesh.empty or ENV in mesh.manual_axes

@@ -77,10 +77,10 @@ def _trust_region_step(
 
     This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
     """
-    samples = sharding.shard(samples)
+    samples, nets = sharding.shard(samples), setup.nets.plain  # the Fisher matrix takes second derivatives
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return setup.nets.policy(unravel(flat), samples.obs)
+        return nets.policy(unravel(flat), samples.obs)
 
     mean0, std0 = jax.lax.stop_gradient(policy(start))
 

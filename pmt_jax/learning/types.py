@@ -84,6 +84,7 @@ class Batch:
         and with this step; complete if the episode is done.
       whole: [T, B] bool, the time limit counts from the episode's own beginning; False in first ones with spread starts
         (see `rollout.start`), which it cuts short.
+      next_obs: [T, B, N, O], those before any reset; None where critics see the state.
     """
 
     obs: jax.Array
@@ -106,6 +107,7 @@ class Batch:
     true_episode_cost: jax.Array
     episode_length: jax.Array
     whole: jax.Array
+    next_obs: jax.Array | None = None
 
     @property
     def done(self) -> jax.Array:
@@ -178,7 +180,7 @@ class LearnerState(ActingState):
 
     Attributes:
       actor, obs_moments, update: of ActingState.
-      critic: V(s) -> []; cost_critic: Vc(s) -> [N, K].
+      critic: V(s) -> []; cost_critic: Vc(s) -> [N, K]; of each agent's own observation V(o_i) -> [], Vc(o_i) -> [K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         without them.
       constraint: estimate of the cost, multiplier and lowered limit, [N, K].

@@ -22,7 +22,7 @@ from ..training.compile import evaluate_seeds
 from ..training.health import FAULTS, NO_ROOM, faults
 from ..training.metrics import seed_intervals
 from ..training.run_folder import MATMUL_PRECISION
-from . import hub
+from . import hub, minari_dataset
 from .load import load_run
 
 
@@ -47,7 +47,8 @@ def evaluate_run(
       which: `last` or `best`.
       physics: an engine other than the run's.
       say: called with a sentence for each damaged checkpoint, which is passed over.
-      save: an .npz file for every step of every episode (docs/howto/evaluate.md lists its arrays).
+      save: an .npz file for every step of every episode (docs/howto/evaluate.md lists its arrays), or the name of a
+        Minari data set, minari:NAME-v0.
 
     Raises:
       UsageError: there is no such run, the physics lost contacts, or `save` cannot be written.
@@ -123,12 +124,16 @@ def _take_faults(results: dict[str, np.ndarray]) -> list[str]:
 
 
 def _check_ending(save: pathlib.Path | None) -> None:
-    if save is not None and save.suffix != ".npz":
-        raise UsageError(f"cannot write {save}: its ending must be .npz")
+    if save is not None and str(save).startswith(minari_dataset.PREFIX):
+        minari_dataset.check(str(save))
+    elif save is not None and save.suffix != ".npz":
+        raise UsageError(f"cannot write {save}: its ending must be .npz, or its beginning {minari_dataset.PREFIX}")
 
 
 def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: int) -> dict[str, np.ndarray]:
     """Writes what was recorded of every step [seeds, horizon, episodes, ...] as [seeds, episodes, steps, ...].
+
+    Of the observations after a step, the last of an episode is kept; the others are those before the next step.
 
     Returns:
       the other metrics.
@@ -137,6 +142,11 @@ def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: i
     recorded = {name: x.swapaxes(1, 2)[:, :, : length.max()] for name, x in results.items() if name.startswith(STEP)}
     table: dict[str, Any] = {"seed": np.arange(first_seed, first_seed + len(length)), "length": length}
     table |= {name.removeprefix(STEP): x for name, x in recorded.items()}
+    last = np.maximum(length - 1, 0)[:, :, None, None, None]
+    table["final_obs"] = np.take_along_axis(table.pop("next_obs"), last, axis=2)[:, :, 0]
+    if str(out).startswith(minari_dataset.PREFIX):
+        minari_dataset.write(str(out), table)
+        return {name: x for name, x in results.items() if name not in recorded}
     with writing(out) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **table)
     return {name: x for name, x in results.items() if name not in recorded}

@@ -14,30 +14,40 @@ from ..files import writing_folder
 from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import Params, RunningMoments
-from . import numpy_policy
+from . import numpy_policy, onnx_policy
 from .load import load_seed, policy_function
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 
-def export_policy(folder: str | pathlib.Path, out: pathlib.Path, seed: int | None = None, which: str = "last") -> None:
-    """Writes a run's policy into the folder `out`, three files:
+def export_policy(
+    folder: str | pathlib.Path, out: pathlib.Path, seed: int | None = None, which: str = "last", onnx: bool = False
+) -> list[str]:
+    """Writes a run's policy into the folder `out`, three files or four, and returns their names:
 
     policy.stablehlo: `jax.export` of obs [batch, N, O] -> action [batch, N, A], f32, for CPU, CUDA, ROCm and TPU;
-    policy.npz: its weights; numpy_policy.py: a loader of these in NumPy alone.
+    policy.npz: its weights; numpy_policy.py: a loader of these in NumPy alone;
+    policy.onnx: with `onnx` the same function as an ONNX graph, checked by onnxruntime before anything is written.
 
     Raises:
-      UsageError: as `load_policy`, or `out` cannot be written.
+      UsageError: as `load_policy`, or `out` cannot be written; the extra `onnx` is missing.
     """
     setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
     spec = setup.vector.spec
     batch = jax.export.symbolic_shape(f"batch, {spec.num_agents}, {spec.obs_dim}")
     program = jax.jit(jax.vmap(policy_function(setup, state)))
     exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(batch, jnp.float32))
+    named = weights(setup, state.actor.params, state.obs_moments)
     with writing_folder(out) as partial:
         (partial / "policy.stablehlo").write_bytes(exported.serialize())
-        np.savez(partial / "policy.npz", **weights(setup, state.actor.params, state.obs_moments))  # pyright: ignore[reportArgumentType] (its stub)
+        np.savez(partial / "policy.npz", **named)  # pyright: ignore[reportArgumentType] (its stub)
         (partial / "numpy_policy.py").write_text(inspect.getsource(numpy_policy))
+        if onnx:
+            noise = np.random.default_rng(0).standard_normal((64, spec.num_agents, spec.obs_dim))
+            obs = np.asarray(named["obs_mean"] + named["obs_scale"] * noise, np.float32)
+            onnx_policy.write(named, partial / "policy.onnx")
+            onnx_policy.check(partial / "policy.onnx", obs, np.asarray(program(obs)))
+    return ["policy.stablehlo", "policy.npz", "numpy_policy.py", *(["policy.onnx"] if onnx else [])]
 
 
 def weights(setup: Setup, params: Params, moments: RunningMoments) -> dict[str, np.ndarray]:

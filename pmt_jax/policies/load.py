@@ -24,13 +24,15 @@ Policy = Callable[[jax.Array], jax.Array]
 
 
 def check_trusted(folder: pathlib.Path) -> None:
-    """Refuses a run whose task is a Python file that this user has neither trained with nor said to trust.
+    """Refuses a run whose task or method is in a Python file that this user has neither trained with nor said to trust.
 
     Raises:
       UsageError: loading the run would execute that file, or one in the run folder.
     """
     if not hub.is_name(folder) and (folder / "config.toml").is_file():
-        check(load_config(folder / "config.toml").task, f"{folder} is a run of", folder)
+        config = load_config(folder / "config.toml")
+        for name in (config.task, config.method):
+            check(name, f"{folder} is a run of", folder)
 
 
 def load_run(

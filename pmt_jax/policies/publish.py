@@ -17,12 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
+from ..config.methods import METHODS
 from ..errors import UsageError
+from ..files import read_rows
 from ..learning import rollout
 from ..learning.evaluation import is_better
 from ..learning.setup import Setup
 from ..learning.types import ActingState, TrainState
-from ..limits import base
+from ..limits import KEY, base, of_agents
 from ..training.metrics import judged_cost
 from ..training.run_folder import load_saved
 from . import hub
@@ -43,8 +45,10 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
         return _measure(str(folder), episodes)
     run, which, row, state = choose(folder, episodes)
     config = run.config
-    if config.task not in tasks.names():
-        raise UsageError(f"{folder} is of a task of your own, which the package does not have; use pmt export")
+    if config.task not in tasks.names() or config.method not in METHODS:
+        raise UsageError(
+            f"{folder} is of a task or a method of your own, which the package does not have; use pmt export"
+        )
     packed = hub.rounded(state)
     facts = {
         "task": config.task,
@@ -56,6 +60,7 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
         "unpacked": _chosen_by(row),
         "packed": _chosen_by(evaluate_states(run, packed, episodes, deterministic=True, fresh=False)[0]),
         "action_change": action_change(run, packed, state),
+        "trained": trained(folder, row["seed"]),
         "training": json.loads((folder / "versions.json").read_text()),
     }
     name = f"{hub.PREFIX}{config.task}/{config.method}"
@@ -98,6 +103,24 @@ def choose(folder: pathlib.Path, episodes: int) -> tuple[Setup, str, dict[str, A
     which, seed = divmod(chosen, run.config.seeds)
     row = rows[chosen] | {"seed": run.config.seed + seed}
     return run, WHICH[which], row, jax.tree.map(lambda x: x[chosen : chosen + 1], both)
+
+
+def trained(folder: pathlib.Path, seed: int) -> dict[str, Any] | None:
+    """What a seed's training episodes, with noise, reached in the last tenth of the steps; None if no row says it.
+
+    Returns:
+      episode_reward, episode_cost (of the worst agent, where they differ) and whether that is `within` the limit.
+    """
+    rows = [row for row in read_rows(folder / "metrics.jsonl") if row.get("seed") == seed]
+    steps = max((row["step"] for row in rows), default=0)
+    last = [row for row in rows if row["step"] > 0.9 * steps and row.get("episode_reward") is not None]
+    if not last:
+        return None
+    names = [name for name in last[0] if base(name) in ("episode_reward", "episode_cost", KEY)]
+    means = {name: round(float(np.mean([row[name] for row in last])), 6) for name in names}
+    cost, limit = judged_cost(means, "")
+    worst = max(of_agents(means, "episode_cost") or [means["episode_cost"]])
+    return {"episode_reward": means["episode_reward"], "episode_cost": worst, "within": bool(cost <= limit)}
 
 
 def figures(row: dict[str, Any]) -> dict[str, list[float]]:

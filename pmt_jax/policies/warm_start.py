@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ..config.methods import label
 from ..errors import UsageError
 from ..learning import learner, sharding
 from ..learning.setup import Setup
@@ -76,7 +77,9 @@ def _fear(source: str, like: LearnerState, setup: Setup) -> dict[str, Any]:
     """The fear of the other run and its moments of states; if teams differ, all agents begin with the mean fear."""
     other, state = load_run(pathlib.Path(source))
     if like.fear is None:
-        raise UsageError(f"init_fear is for methods with a fear network (f4sg, mixed), not for {setup.config.method}")
+        raise UsageError(
+            f"init_fear is for methods with a fear network (f4sg, mixed), not for {label(setup.config.method)}"
+        )
     if not isinstance(state, LearnerState) or state.fear is None:
         raise UsageError(f"{source} has no fear network; init_fear needs a run folder of f4sg or mixed")
     ours, theirs = setup.vector.spec, other.vector.spec
@@ -108,6 +111,7 @@ def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
         raise UsageError(
             f"{name} of {source} has other shapes than this run's; start from a run of a task with the same "
             "observations and agents, with the same hidden and layer_norm, and of a method that also "
-            "has one policy for all agents (mappo) or one for each (all others)"
+            "has one policy for all agents (mappo, ippo) or one for each (all others), and critics of the same "
+            "(ippo and ippo_l have those of observations)"
         )
     return jax.tree.map(lambda x, new: x[jnp.arange(new.shape[0]) % x.shape[0]], theirs, like)

@@ -18,6 +18,8 @@ from ..studies.run_log import Group, RunLog, read_all
 from ..training.health import faults
 from . import episode, page
 
+FIRST = ("method", "task", "limit", "seeds within", "worst seed")  # columns of the scores that must be in view
+
 
 def report(
     folders: Sequence[pathlib.Path],
@@ -63,12 +65,11 @@ def _heading(title: str, logs: Sequence[RunLog]) -> list[str]:
 def _table(logs: Sequence[RunLog]) -> list[str]:
     """The table that `pmt table` prints of the runs."""
     head, lines, notes = table.cells(rows(logs, note=lambda _: None))
+    first = [head.index(name) for name in FIRST]
+    order = first + [i for i in range(len(head)) if i not in first]
+    cells = [[line[i].replace(", ", ",\u00a0") for i in order] for line in lines]  # an interval may go below its mean
     explained = f"<details><summary>What the columns mean</summary><p>{html.escape(' '.join(notes))}</p></details>"
-    return ["<h2>Scores</h2>", page.table([*head[1:2], *head[:1], *head[2:]], _method_first(lines)), explained]
-
-
-def _method_first(lines: Sequence[Sequence[str]]) -> list[list[str]]:
-    return [[line[1], line[0], *line[2:]] for line in lines]
+    return ["<h2>Scores</h2>", f'<div class="scores">{page.table([head[i] for i in order], cells)}</div>', explained]
 
 
 # ---------------------------------------------------------------------------------------------------------------------

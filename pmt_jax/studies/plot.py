@@ -52,6 +52,13 @@ METHOD_COLOURS = {
     "f4sg": RED,
     "r4sg": GREEN,
     "mixed": ORANGE,
+    # Methods that are not the paper's have shades of the same.
+    "ippo": "#b3b3b3",
+    "ippo_l": "#003f63",
+    "mappo_pid": "#66c2e8",
+    "crpo": "#8c4a75",
+    "p3o": "#8a3d00",
+    "focops": "#00553d",
 }
 OTHER_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, GREY)  # of settings of one method, of methods not in METHODS
 DASHES = ("", "6 2", "1.5 2", "6 2 1.5 2")  # in line widths, as SVG has them

@@ -40,7 +40,8 @@ def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", l
     absent = [task for task in wanted["tasks"] if task not in names()]
     if absent:
         raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
-    plans = {task: plan(task, wanted.get("methods", list(METHODS)), settings) for task in wanted["tasks"]}
+    methods = wanted.get("methods", paper.get("methods", list(METHODS)))
+    plans = {task: plan(task, methods, settings) for task in wanted["tasks"]}
     check_tasks(next(iter(points.values())) for points in plans.values())
     with contextlib.ExitStack() as stack:
         for task in plans:

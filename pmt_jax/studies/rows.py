@@ -10,7 +10,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -86,6 +86,8 @@ class TableRow:
       excess: [seeds] cost beyond the limit, see `RunLog.excess`; of the cost in `scores` if None.
       true_limits: on true costs; None if unknown.
       faults: which steps broke the contract of tasks, in a sentence; empty if none did.
+      deployed: `reward`, `cost` (of the worst agent) and `beyond` [seeds] of the evaluations under mean actions that
+        ended the runs; empty if none has one.
     """
 
     task: str
@@ -98,6 +100,7 @@ class TableRow:
     excess: np.ndarray | None = None
     true_limits: Limits | None = None
     faults: str = ""
+    deployed: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def score(self, column: str) -> np.ndarray:
         """[seeds] of a column, nan if the row does not have it; where agents share costs, all are the worst agent."""
@@ -166,7 +169,30 @@ def _row(group: Group) -> TableRow:
             sum((run.faults for run in group.runs), collections.Counter()),
             sum(len(run.seeds) * int(run.steps[-1]) for run in group.runs),
         ),
+        deployed=_deployed(group),
     )
+
+
+def _deployed(group: Group) -> dict[str, np.ndarray]:
+    """See `TableRow.deployed`."""
+    ends = [run.deployed for run in group.runs]
+    if not any(ends):
+        return {}
+    unknown = [np.full(len(run.seeds), np.nan) for run in group.runs]
+
+    def joined(read: Callable[[RunLog], np.ndarray | None]) -> np.ndarray:
+        found = [read(end) if end else None for end in ends]
+        return np.concatenate([other if x is None else x for x, other in zip(found, unknown, strict=True)])
+
+    def cost(end: RunLog) -> np.ndarray | None:
+        worst = end.final(f"episode_cost{WORST}")
+        return end.final("episode_cost") if worst is None else worst
+
+    return {
+        "reward": joined(lambda end: end.final("episode_reward")),
+        "cost": joined(cost),
+        "beyond": joined(lambda end: end.excess),
+    }
 
 
 def shown(rows: Sequence[TableRow]) -> list[Column]:

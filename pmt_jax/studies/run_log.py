@@ -20,6 +20,7 @@ from ..config.settings import Config
 from ..errors import UsageError
 from ..files import Note, read_rows, to_stderr
 from ..limits import KEY, LARGEST, WORST, Limits, judged, of_agents
+from ..training import final
 from ..training.health import count_faults
 from ..training.history import checkpoint_steps, missing_rows, read_changes
 from . import program_folder
@@ -44,6 +45,7 @@ class RunLog:
       metrics: {name: [S, P]} the metrics that are numbers, nan where unknown.
       versions: what the numbers depend on besides the settings.
       broken: {seed: step} of those that stopped training before the end, which have no final metrics.
+      evaluation: {name: [S]} what the last policies reach under mean actions (training/final.py), nan where unknown.
     """
 
     folder: pathlib.Path
@@ -56,6 +58,13 @@ class RunLog:
     metrics: dict[str, np.ndarray]
     versions: dict[str, Any] = dataclasses.field(default_factory=dict)
     broken: dict[int, int] = dataclasses.field(default_factory=dict)
+    evaluation: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    @property
+    def deployed(self) -> RunLog | None:
+        """The same run with the evaluation that ended it as its only metrics; None if there was none."""
+        metrics = {name: values[:, None] for name, values in self.evaluation.items()}
+        return dataclasses.replace(self, steps=self.steps[-1:], metrics=metrics, evaluation={}) if metrics else None
 
     @property
     def identity(self) -> str:
@@ -143,7 +152,8 @@ class RunLog:
             raise UsageError(f"{self.folder} has no metrics up to step {step:,}: its first are of {self.steps[0]:,}")
         metrics = {name: values[:, kept] for name, values in self.metrics.items()}
         broken = {seed: at for seed, at in self.broken.items() if at <= step}
-        return dataclasses.replace(self, steps=self.steps[kept], metrics=metrics, broken=broken)
+        evaluation = self.evaluation if kept.all() else {}
+        return dataclasses.replace(self, steps=self.steps[kept], metrics=metrics, broken=broken, evaluation=evaluation)
 
     def thinned(self, points: int) -> RunLog:
         """The same run with its metrics averaged into at most so many points, over what is known in each."""
@@ -184,7 +194,8 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
             raise UsageError(f"{path} is a pretrained policy, which has no metrics of its training; name a run folder")
         if not path.exists():
             raise UsageError(f"{path} is not a run folder: there is no such folder")
-        folders, begun = list(_folders(path)), _under_way(path, note)
+        begun = _under_way(path, note)  # first: what ends meanwhile is then found in both places
+        folders = list(_folders(path))
         logs += [log for log in begun if all(log.folder != other.folder for other in logs)]
         if not folders and not begun:
             reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
@@ -233,8 +244,13 @@ def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
     found = []
     for group in sorted(path.rglob(".group-*")):
         metrics = group / "run" / "metrics.jsonl"
-        configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
-        rows = program_folder.rows(group, configs, note)
+        try:
+            configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
+            rows = program_folder.rows(group, configs, note)
+        except (UsageError, OSError):
+            if not group.exists():  # its points have their own folders since a moment ago
+                continue
+            raise
         missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
         logs = [_log(group.parent / name, rows[name], metrics, configs[name], note) for name in missing]
         if logs:
@@ -265,7 +281,17 @@ def _log(
         metrics=_metrics(rows, seeds, steps, metrics),
         versions=_versions(metrics.parent),
         broken={row["seed"]: row["step"] for row in reversed(rows) if row.get("broken") is not None},
+        evaluation=_evaluation(folder, seeds, steps[-1], note) if folder == metrics.parent else {},
     )
+
+
+def _evaluation(folder: pathlib.Path, seeds: list[int], step: int, note: Note) -> dict[str, np.ndarray]:
+    """{name: [S]} of the evaluation after the last step; {} if there was none."""
+    rows = [row for row in final.read(folder, step, note) if row.get("seed") in seeds]
+    for row in rows:
+        _check(row, folder / final.FILE)
+    known = [{name: x for name, x in row.items() if name != "actions"} for row in rows]
+    return {name: x[:, 0] for name, x in _metrics(known, seeds, [step], folder / final.FILE).items()}
 
 
 def _config(file: pathlib.Path) -> Config:

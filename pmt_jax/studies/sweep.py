@@ -11,7 +11,7 @@ import json
 import pathlib
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
-from ..training import lock, trainer
+from ..training import final, lock, trainer
 from ..training.checkpoint import Checkpoints, Provenance
 from ..training.run_folder import Rescue, Say, load_saved
 from . import jobs, program_folder, table
@@ -60,24 +60,39 @@ def sweep(parts: Sequence[Part], points: Points, out: pathlib.Path, launch: Laun
       The exit code of `trainer.train`: 0 when all points are finished.
 
     Raises:
-      UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
+      UsageError: as `prepare`.
     """
     with lock.acquire(out):
-        wanted = missing_programs(points, out, launch.say)
-        if values := drawn(parts, points):
-            seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
-            launch.say(f"drawn with seed {seeds}: {out / 'draws.json'}")
-            with writing(out / "draws.json") as partial:
-                partial.write_text(json.dumps(values, indent=1) + "\n")
-        configs = [config for program in wanted for config in program.points.values()]
-        if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
-            check_tasks(configs)
+        wanted = prepare(parts, points, out, launch.say)
         code = train_programs(wanted, launch)
     if code == 0:
-        launch.say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
-        found = rows(read_all([out / name for name in points]), launch.say)
-        launch.say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
+        say_best(points, out, launch.say)
     return code
+
+
+def prepare(parts: Sequence[Part], points: Points, out: pathlib.Path, say: Say) -> list[Program]:
+    """What is missing of the `points` of `parts`, once it is known that it can be trained; writes draws.json.
+
+    Raises:
+      UsageError: `out` holds a point of the same name with other settings, or a task cannot run here.
+    """
+    wanted = missing_programs(points, out, say)
+    if values := drawn(parts, points):
+        seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
+        say(f"drawn with seed {seeds}: {out / 'draws.json'}")
+        with writing(out / "draws.json") as partial:
+            partial.write_text(json.dumps(values, indent=1) + "\n")
+    configs = [config for program in wanted for config in program.points.values()]
+    if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made
+        check_tasks(configs)
+    return wanted
+
+
+def say_best(points: Points, out: pathlib.Path, say: Say) -> None:
+    """Prints the table of all points, which are finished."""
+    say("\nbest first: by reward within the cost limit, then by cost beyond it\n")
+    found = rows(read_all([out / name for name in points]), say)
+    say(table.render(sorted(found, key=lambda row: (row.task, row.rank))))
 
 
 def check_tasks(configs: Iterable[Config]) -> None:
@@ -103,6 +118,16 @@ class Program:
     points: Points
     out: pathlib.Path
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether all its points have their folders."""
+        return all((self.out / name / "config.toml").is_file() for name in self.points)
+
+    @property
+    def number(self) -> int:
+        """That of its folder, from 1."""
+        return int(self.folder.name.split("-")[1])
+
     def title(self, number: int, count: int) -> str:
         """What is said of it, the `number`-th of `count`."""
         seeds = next(iter(self.points.values())).seeds
@@ -127,7 +152,7 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
     """Trains programs one after the other, or several at a time in processes of their own; returns the exit code."""
     cache, say, devices, at_a_time = launch
     for program in programs:
-        _write_points(program)
+        write_points(program)
     titled = [(program.title(number, len(programs)), program) for number, program in enumerate(programs, 1)]
     if at_a_time > 1:
         for title, program in titled:
@@ -145,7 +170,7 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
     return 0
 
 
-def _write_points(program: Program) -> None:
+def write_points(program: Program) -> None:
     try:
         (program.folder / "points").mkdir(parents=True, exist_ok=True)
         for name, config in program.points.items():
@@ -186,10 +211,22 @@ def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
 
 
 def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say, devices: int | None) -> int:
-    """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`."""
-    group = program_folder.points(folder)
-    if not group:
-        raise UsageError(f"{folder} holds no points to train; it was deleted or replaced meanwhile")
+    """Trains the points of a hidden `folder` side by side, or continues it; then each gets its folder in `out`.
+
+    Raises:
+      InUse: another process trains them.
+      UsageError: the folder is gone.
+    """
+    with lock.acquire(folder):
+        group = program_folder.points(folder)
+        if not group:
+            raise UsageError(f"{folder} holds no points to train; it was deleted or replaced meanwhile")
+        return _train_group(folder, group, out, cache, say, devices)
+
+
+def _train_group(
+    folder: pathlib.Path, group: Points, out: pathlib.Path, cache: bool, say: Say, devices: int | None
+) -> int:
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])
     settings = [dataclasses.replace(setup, config=config).hyper for config in configs]
@@ -201,12 +238,15 @@ def train_program(folder: pathlib.Path, out: pathlib.Path, cache: bool, say: Say
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}
-    how = {"cache": cache, "say": say, "devices": devices, "warm_start": warm_start.prepare}
-    with lock.acquire(folder):
-        code = trainer.train(common, folder / "run", resume=begun, trials=trials, rescue=Rescue(out, files), **how)
-        if code == 0:
-            code = _finish(folder, group, out, say)
-    return code
+    how = {
+        "cache": cache,
+        "say": say,
+        "devices": devices,
+        "warm_start": warm_start.prepare,
+        "rescue": Rescue(out, files),
+    }
+    code = trainer.train(common, folder / "run", resume=begun, trials=trials, **how)
+    return code or _finish(folder, group, out, say)
 
 
 def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) -> int:
@@ -218,10 +258,17 @@ def _finish(folder: pathlib.Path, group: Points, out: pathlib.Path, say: Say) ->
     return 0
 
 
+def _of_point(rows: list[dict[str, Any]], config: Config, first: int, limits: dict[str, float]) -> list[dict[str, Any]]:
+    """The lines of evaluation.jsonl of a point whose trials begin with the `first`, as of a run of its own."""
+    own = [row for row in rows if row["seed"] in range(first, first + config.seeds)]
+    return [row | {"seed": config.seed + row["seed"] - first} | limits for row in own]
+
+
 def cut_points(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
     """Cuts a finished group's run into one folder a point; each appears whole or not at all."""
     setup, step, saved = load_saved(folder / "run")
     rows = program_folder.rows(folder, group)
+    evaluation = final.read(folder / "run", step)
     for number, (name, config) in enumerate(group.items()):
         if (out / name / "config.toml").is_file():
             continue
@@ -233,6 +280,7 @@ def cut_points(folder: pathlib.Path, group: Points, out: pathlib.Path) -> None:
         part.mkdir()
         (part / "config.toml").write_text(to_toml(config))
         (part / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in own))
+        final.write(part, _of_point(evaluation, config, first, limits.columns))
         shutil.copy(folder / "run" / "versions.json", part)
         checkpoints = Checkpoints(part)
         mine = jax.tree.map(lambda x: x[first : first + config.seeds], saved)  # noqa: B023

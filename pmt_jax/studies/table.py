@@ -20,6 +20,8 @@ from . import effects, statistics
 from .rows import Column, TableRow, compared, shown
 
 FORMATS = (*formats.WRITERS, "json")
+DEPLOYED = {"reward": Column("reward", "episode_reward"), "cost": Column("cost", "episode_cost", 0)}
+UNDER_MEAN = [f"mean-action {name}" for name in (*DEPLOYED, "seeds within")]
 
 
 def render(table: Sequence[TableRow], layout: str = "text", baseline: str | None = None, test: bool = False) -> str:
@@ -84,6 +86,10 @@ def summarise(table: Sequence[TableRow], baseline: str | None = None) -> list[di
         data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, KEY: row.limits.total}
         data |= {c.name: _estimate(row.scores[c.name], c) for c in shown(table) if c.name in row.scores}
         data |= {"within": float((row.beyond <= 0).mean()), "worst": _finite(cost.max())}
+        if row.deployed:
+            measured = {name: _estimate(row.deployed[name], DEPLOYED[name]) for name in DEPLOYED}
+            known = row.deployed["beyond"][np.isfinite(row.deployed["beyond"])]
+            data["mean_actions"] = {**measured, "within": int((known <= 0).sum()), "seeds": len(known)}
         data |= {"better": against and against.better, "p": against and against.p}
         reported = given.get(row.method, {})
         data["paper"] = {"table": given.get("table"), "source": given.get("source"), "rerun": {}, **reported}
@@ -117,6 +123,8 @@ def _cells(
     papers = [(who, column) for who in reported for column in columns if any(column in row for row in reported[who])]
     better = effects.names(compared(table)) if baseline else ()
     head = ["task", "method", "seeds", "steps", *columns, "limit", "seeds within", "worst seed"]
+    ended = any(row.deployed for row in table)
+    head += UNDER_MEAN * ended
     head += [f"P({name})" for name in better] + [f"p ({name})" for name in better if test]
     head += [f"{who} {column}" for who, column in papers]
     body = []
@@ -125,11 +133,19 @@ def _cells(
         line = [row["task"], f"{row['method']} {row['settings']}".strip(), str(row["seeds"]), f"{row['steps']:,}"]
         line += [_interval(row.get(column), "iqm") for column in columns]
         line += [table[i].limit_on(compared(table)[1]), within, number(row["worst"])]
+        line += _under_mean(row.get("mean_actions")) * ended
         line += [_interval((row["better"] or {}).get(name), "probability") for name in better]
         line += [number((row["p"] or {}).get(name), ".2g") for name in better if test]
         given = (reported[who][i].get(column) for who, column in papers)
         body.append(line + [" ± ".join(format(part, ".2f") for part in x) if x else "-" for x in given])
     return head, body
+
+
+def _under_mean(measured: dict[str, Any] | None) -> list[str]:
+    """The cells of UNDER_MEAN."""
+    if not measured:
+        return ["-"] * len(UNDER_MEAN)
+    return [*(_interval(measured[name], "iqm") for name in DEPLOYED), f"{measured['within']}/{measured['seeds']}"]
 
 
 def _interval(estimate: dict[str, float | None] | None, middle: str) -> str:
@@ -153,6 +169,11 @@ def _notes(table: Sequence[TableRow], data: Sequence[dict[str, Any]], baseline: 
         "Interquartile mean over seeds, below four the mean [95 % studentised interval]; -: unknown, or not finite for "
         "some seed; [-]: one seed has no interval.",
     ]
+    if any(row.deployed for row in table):
+        notes.append(
+            "mean-action: the last policies in the evaluation that ended the run, 64 whole episodes a seed without "
+            "noise, as one deploys them; cost and seeds within by the worst agent."
+        )
     notes += [f"{row.label} on {row.task}: {row.faults}." for row in table if row.faults]
     if baseline:
         notes.append(f"P: probability that a seed of the row does better than a seed of {baseline}; ties count half.")

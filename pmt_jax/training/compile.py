@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
+from ..config.methods import label
 from ..errors import UsageError
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
@@ -26,7 +27,7 @@ from ..learning.maths import running_moments
 from ..learning.setup import Setup
 from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 from ..output import Say
-from . import chunks
+from . import chunks, final
 
 FLOAT = 4  # bytes
 KERNEL_LINES = 5.0  # seconds between two of them
@@ -42,6 +43,7 @@ class Programs(NamedTuple):
       where_seed: chosen [seeds] bool, old (which it consumes), new -> old, with the chosen seeds' states from new.
       evaluate: state -> metrics of `evaluate` [seeds, episodes], under mean actions; None if the run never evaluates.
       measures: the names of these metrics.
+      final: as `evaluate`, of the episodes that end a run (see final.py); compiled when it is called.
       close: ends what runs next to this process for them.
     """
 
@@ -49,6 +51,7 @@ class Programs(NamedTuple):
     where_seed: Callable[[np.ndarray, LearnerState, LearnerState], LearnerState]
     evaluate: Callable[[LearnerState], Metrics] | None = None
     measures: tuple[str, ...] = ()
+    final: Callable[[LearnerState], Metrics] | None = None
     close: Callable[[], object] = lambda: None
 
 
@@ -75,7 +78,8 @@ def check_memory(setup: Setup) -> None:
     """
     config, spec = setup.config, setup.vector.spec
     memory = device_memory() * (setup.mesh.size if setup.mesh else 1)
-    batch = config.batch_size * (spec.num_agents * spec.obs_dim + spec.state_dim)
+    observed = spec.num_agents * spec.obs_dim * (2 if setup.own_critics else 1)
+    batch = config.batch_size * (observed + spec.state_dim)
     widths = (spec.obs_dim, *config.hidden, spec.action_dim)
     networks = 3 * spec.num_agents * sum(x * y for x, y in itertools.pairwise(widths))
     for what, floats in (
@@ -117,9 +121,9 @@ def cache_events() -> Iterator[list[str]]:
 def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
     config = setup.config
-    say(f"compiling {config.method} on {setup.vector.spec.name} ...")
+    say(f"compiling {label(config.method)} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
-    with compiling(_kernels(setup, say), say):
+    with compiling(_kernels(setup, say), say), tasks.announcing(say):
         state, programs, found = _compile_programs(setup, say)
         later = "; the first row compiles the checks of --debug" if setup.debug else ""
         say(f"compiled in {time.monotonic() - begin:.1f} s (compile cache {found}){later}")
@@ -144,7 +148,11 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     with sharding.use_mesh(setup.mesh), cache_events() as events:
         one = np.int32(1)
         compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(xla_options())
-    programs = Programs(functools.partial(_run_chunk, compiled, hyper), jax.jit(where_seed, donate_argnums=1))
+    programs = Programs(
+        functools.partial(_run_chunk, compiled, hyper),
+        jax.jit(where_seed, donate_argnums=1),
+        final=_final(setup),
+    )
     if config.eval_interval:
         say(f"compiling the evaluation, {config.eval_episodes} episodes a seed ...")
         program = jax.jit(evaluate_seeds(setup, config.eval_episodes, deterministic=True), out_shardings=everywhere)
@@ -153,6 +161,19 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
         programs = programs._replace(evaluate=evaluation, measures=tuple(evaluation.out_info))
     found = "hit" if "cache_hits" in events else "miss" if events else "off"
     return state, programs, found
+
+
+def _final(setup: Setup) -> Callable[[LearnerState], Metrics]:
+    """See `Programs`."""
+    plain = dataclasses.replace(setup, debug=False)
+    function = evaluate_seeds(plain, final.episodes(setup), deterministic=True)
+    program = jax.jit(function, out_shardings=sharding.replicated(setup.mesh), compiler_options=xla_options())
+
+    def run(state: LearnerState) -> Metrics:
+        with sharding.use_mesh(setup.mesh):
+            return jax.device_get(program(state))
+
+    return run
 
 
 def _run_chunk(

@@ -26,6 +26,10 @@ class Gone(UsageError):
     """A folder was deleted, renamed or replaced while this process worked in it."""
 
 
+class InUse(UsageError):
+    """Another process works in a folder."""
+
+
 class _Lock(NamedTuple):
     """A lock of this process: the absolute path of its file, the open file, and whether the folder was made for it."""
 
@@ -49,7 +53,8 @@ def acquire(folder: pathlib.Path, created: bool = False) -> Iterator[None]:
     A folder that is not there is made. Made here, or `created` for this, it is removed if it stays empty.
 
     Raises:
-      UsageError: another process has it, or it cannot be written.
+      InUse: another process has it.
+      UsageError: it cannot be written.
     """
     path = folder.absolute() / NAME
     try:
@@ -158,9 +163,9 @@ def _may_be_alive(owner: dict[str, Any], locked: bool) -> bool:
     return not locked
 
 
-def _refusal(folder: pathlib.Path, owner: dict[str, Any]) -> UsageError:
+def _refusal(folder: pathlib.Path, owner: dict[str, Any]) -> InUse:
     host = owner.get("host", socket.gethostname())
     who = f"process {owner.get('pid', '?')}{'' if host == socket.gethostname() else f' on {host}'}"
     since = f" since {owner['since']}" if "since" in owner else ""
     gone = "" if host == socket.gethostname() else f"; if that process is gone, delete {folder / NAME}"
-    return UsageError(f"{folder} is in use by {who}{since}{gone}; wait for it, or choose another --out")
+    return InUse(f"{folder} is in use by {who}{since}{gone}; wait for it, or choose another --out")

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..config.methods import label
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
 from ..limits import WORST, Limits, base, judged, of_agents
@@ -88,6 +89,7 @@ METRICS: dict[str, Metric] = {
     "actor/clipped": Metric("", "share of rows whose weighted probability ratio is outside the clip interval"),
     "actor/kl_per_agent": Metric("nats", "KL(old, new) of an update, mean over the batch, agents and updates"),
     "actor/share_of_step": Metric("", "share of an update's step that `kl_max` kept"),
+    "actor/penalty": Metric("", "P3O's penalty before its weight, in an update's last epoch"),
     "actor/case": Metric("", "which case of the trust-region problem was solved"),
     "actor/reach": Metric("cost per step", "most that a step of the trust region promises to take off the cost"),
     "actor/line_search_steps": Metric("", "steps of the line search that were tried in vain"),
@@ -139,7 +141,7 @@ def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> lis
             "step": step,
             "seed": config.seed + i,
             "task": setup.vector.spec.name,
-            "method": config.method,
+            "method": label(config.method),
             **limits.columns,
             "broken": None,
             **_worst_of_row({name: _reduce(name, np.asarray(x[i]), episodes[i]) for name, x in metrics.items()}),

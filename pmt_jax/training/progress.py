@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
+import threading
 import time
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from ..limits import WORST, Limits
-from ..output import dropped_if_closed
+from ..output import Say, dropped_if_closed
 from .metrics import Row
 
 HISTORY = 12  # rows of the live table
@@ -38,11 +41,32 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+@contextlib.contextmanager
+def alive(what: str, say: Say, first: float = 5.0, longest: float = 30.0) -> Iterator[None]:
+    """Says how long `what` has taken, while the code inside prints nothing: after 5 s, 10 s, 20 s, then every 30 s."""
+    begin, ended = time.monotonic(), threading.Event()
+
+    def speak() -> None:
+        wait = first
+        while not ended.wait(wait):
+            passed = time.monotonic() - begin
+            say(f"{what}: {duration(passed)} so far ...")
+            wait = min(passed, longest)
+
+    thread = threading.Thread(target=speak, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 class Progress:
     """Means over seeds of the newest metrics, steps per second of training alone, and the time left of everything.
 
-    Metrics of episodes are those of the last row in which an episode ended. A terminal gets a live table, a pipe one
-    line every few seconds.
+    Metrics of episodes are those of the last row in which an episode ended. A terminal gets a live table, whose last
+    line is always the newest and which grows every few seconds; a pipe gets a line every few seconds.
     """
 
     def __init__(self, total: int, done: int = 0, console: Console | None = None, every: float = 5.0) -> None:
@@ -87,12 +111,15 @@ class Progress:
         return self._number("episode_cost", ".2f") + (f", worst agent {worst}" if worst != "-" else "")
 
     def _print(self, cells: tuple[str, ...], last: bool) -> None:
-        self._history = [*self._history, cells][-HISTORY:]
+        is_due = time.monotonic() - self._printed >= self._every
         if self._live:
+            older = self._history if is_due else self._history[:-1]  # the newest row is replaced until it is old enough
+            self._history = [*older, cells][-HISTORY:]
             self._live.update(self._table(), refresh=True)
-        elif last or time.monotonic() - self._printed >= self._every:
-            self._printed = time.monotonic()
+        elif is_due or last:
             print(*(f"{name} {cell}" for name, cell in zip(COLUMNS, cells, strict=True)), sep=", ", flush=True)
+        if is_due:
+            self._printed = time.monotonic()
 
     def _table(self) -> Table:
         """The history, with as many columns as fit."""

@@ -19,14 +19,15 @@ import jax.numpy as jnp
 
 from .. import numerics
 from ..config.load import load_config, to_toml
+from ..config.methods import label
 from ..errors import UsageError
 from ..files import read_rows, replace_text
-from ..learning import learner
+from ..learning import fused, learner
 from ..learning.setup import Setup, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
-from . import lock, processes
+from . import final, lock, processes
 from .checkpoint import Checkpoints, Provenance, Saved, check_name, newest, unpack
 from .history import Row, checkpoint_steps, missing_rows, read_changes
 from .loggers import Jsonl, Logger, open_loggers
@@ -231,6 +232,7 @@ class RunFolder:
         rows = _keep_rows_until(self.path, step, self._say)
         if not ended:
             self._record_changes(step, old)
+            (self.path / final.FILE).unlink(missing_ok=True)  # of policies that train on
         if not ended or self._is_edited:  # a run that has ended gets back what it was trained with
             write_settings(self.path, self._setup)
         if missing := missing_rows(self._setup.config, self._changes, rows, step):
@@ -263,6 +265,24 @@ class RunFolder:
         """
         for logger in self._loggers:
             logger.write(rows)
+
+    @processes.in_first
+    def is_evaluated(self, step: int) -> bool:
+        """Whether the policies after `step` have the evaluation that ends a run."""
+        return bool(final.read(self.path, step, note=lambda _: None))
+
+    def write_evaluation(self, rows: list[Row]) -> None:
+        """Writes the evaluation that ends the run.
+
+        Raises:
+          Gone: the folder is no longer the one that was claimed.
+        """
+        self.check()
+        self._write_evaluation(rows)
+
+    @processes.in_first
+    def _write_evaluation(self, rows: list[Row]) -> None:
+        final.write(self.path, rows)
 
     def save(self, step: int, tree: Any) -> None:
         """Writes a checkpoint, as `Checkpoints.save`.
@@ -308,7 +328,7 @@ class RunFolder:
 def create(setup: Setup) -> pathlib.Path:
     """A new folder runs/TASK-METHOD-TIME, with a number behind it if another run has taken the name."""
     task = re.sub(r"[^\w.+-]+", "-", setup.vector.spec.name).strip(".-") or "task"
-    name = f"{task}-{setup.config.method}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{task}-{label(setup.config.method)}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
     while True:
         out = pathlib.Path("runs") / (name if number == 1 else f"{name}-{number}")
@@ -347,6 +367,7 @@ def versions(setup: Setup) -> dict[str, Any]:
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
     found |= {"python": platform.python_version(), "device": jax.devices()[0].device_kind}
     found |= {"devices": setup.mesh.size if setup.mesh else 1, "workers": setup.workers}
+    found |= {"networks": "fused" if fused.available() else "xla"}
     return found | {"engine": setup.vector.env.engine, "matmul_precision": MATMUL_PRECISION} | numerics.record()
 
 

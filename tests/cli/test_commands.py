@@ -17,7 +17,8 @@ from runs import ARGUMENTS, STEPS, environment, rows
 
 
 def test_a_run_folder(whole: pathlib.Path):
-    assert {p.name for p in whole.iterdir()} == {"config.toml", "metrics.jsonl", "versions.json", "checkpoints"}
+    files = {"config.toml", "metrics.jsonl", "evaluation.jsonl", "versions.json", "checkpoints"}
+    assert {p.name for p in whole.iterdir()} == files
     table = rows(whole)
     assert [r["step"] for r in table[::2]] == list(range(200, STEPS + 1, 200))
     assert [r["seed"] for r in table[:4]] == [0, 1, 0, 1]

@@ -70,6 +70,13 @@ def test_findings_come_from_results(path: pathlib.Path):
     assert not typed(" ".join(findings), made(text)), "let `bench render` fill them (bench/tables/values.py)"
 
 
+@pytest.mark.parametrize("begin", ["Why an emotion?", "Results", "Speed"])
+def test_all_numbers_of_the_readmes_results_are_in_its_tables(begin: str):
+    text = PAGES[0].read_text()
+    (section,) = (section for section in sections(text) if section.startswith(begin))
+    assert not typed(section, made(text))
+
+
 @pytest.mark.parametrize("path", NOTES, ids=page)
 def test_notes_name_command_and_date(path: pathlib.Path):
     """A section with numbers that no block has ends with `*Measured DATE: COMMAND ...*`."""

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
+import os
+import pickle
+import re
 import subprocess
 import sys
 
@@ -72,12 +77,301 @@ def test_gymnasium_ends(vector):
     assert not terminated.any() and "final_obs" not in info
 
 
+@pytest.fixture(scope="module")
+def vectors(vector):
+    """Both modes, on a task whose episodes end by its rule and by the time limit."""
+    return {"SameStep": vector, "NextStep": adapters.to_gymnasium(Fragile(), 3, autoreset_mode="NextStep")}
+
+
+def ends_and_goes_on(env):
+    """An episode of the first environment, and what comes after: what `step` returned each time."""
+    action = np.zeros((3, 2, 2))
+    action[0] = 1.0
+    return [env.step(action), env.step(np.zeros((3, 2, 2)))]
+
+
+def test_gymnasium_tells_the_last_global_state_and_costs_of_an_episode(vectors):
+    """A centralised critic bootstraps from the state before the reset, as from `final_obs`."""
+    for mode, env in vectors.items():
+        env.reset(seed=0)
+        (obs, reward, terminated, _, info), (obs_2, reward_2, terminated_2, _, info_2) = ends_and_goes_on(env)
+        assert terminated.tolist() == [True, False, False]
+        last = info["final_info"] if mode == "SameStep" else info
+        last_obs = info["final_obs"] if mode == "SameStep" else obs
+        fresh, fresh_state = (obs, info["global_state"]) if mode == "SameStep" else (obs_2, info_2["global_state"])
+        np.testing.assert_array_equal(last["global_state"][:, 0], last_obs[:, 0, 0])  # both begin with the position
+        np.testing.assert_array_equal(last["position"][0], (last_obs[0, 0, 0] + 1) / 2)
+        assert last["position"][0] > 0.3 > (fresh[0, 0, 0] + 1) / 2 and fresh_state[0, 0] == fresh[0, 0, 0]
+        assert last["cost"].shape == (3, 2, 1) and (last["cost"] == info["cost"]).all()
+        assert not terminated_2.any() and "final_info" not in info_2
+        if mode == "SameStep":
+            assert info["_final_info"].tolist() == last["_global_state"].tolist() == [True, False, False]
+        else:  # the second step only shows the new episode; the others moved on
+            assert reward_2[0] == 0 and (info_2["cost"][0] == 0).all() and fresh[0, 0, -3] == 0 and reward_2[1] != 0
+            assert (obs_2[:, 0, 5] > 0).tolist() == [False, True, True]  # the time of the episode
+
+
+def test_both_modes_of_gymnasium_show_the_same_episodes(vectors):
+    """Step by step, but for the one step in which `NextStep` shows the start."""
+    action = np.random.default_rng(0).uniform(-1, 0.3, (60, 2, 2))
+    seen = {}
+    for mode, env in vectors.items():
+        obs, _ = env.reset(seed=5)
+        shown = [obs[0]]
+        used, fresh = 0, False
+        while used < 40:
+            joint = np.broadcast_to(action[used], (3, 2, 2))
+            obs, _, terminated, truncated, info = env.step(joint)
+            used += not fresh
+            fresh = bool(terminated[0] | truncated[0]) and mode == "NextStep"
+            ended = terminated[0] | truncated[0]
+            shown += [info["final_obs"][0], obs[0]] if ended and mode == "SameStep" else [obs[0]]
+        seen[mode] = np.stack(shown)
+    np.testing.assert_array_equal(*(x[:40] for x in seen.values()))
+
+
+def wrappers_of_gymnasium():
+    """Every wrapper of vector environments that can be made of one alone, and how."""
+    import gymnasium
+    from gymnasium.wrappers import vector
+
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    made = {
+        "ClipAction": lambda env: vector.ClipAction(env),
+        "ClipReward": lambda env: vector.ClipReward(env, -1, 1),
+        "DictInfoToList": vector.DictInfoToList,
+        "DtypeObservation": lambda env: vector.DtypeObservation(env, np.float64),
+        "FlattenObservation": vector.FlattenObservation,
+        "NormalizeObservation": vector.NormalizeObservation,
+        "NormalizeReward": vector.NormalizeReward,
+        "RecordEpisodeStatistics": vector.RecordEpisodeStatistics,
+        "RescaleAction": lambda env: vector.RescaleAction(env, -0.5, 0.5),
+        "RescaleObservation": lambda env: _bounded(vector, env),
+        "ReshapeObservation": lambda env: vector.ReshapeObservation(env, (16,)),
+        "TransformAction": lambda env: vector.TransformAction(env, lambda x: 0.5 * x),
+        "TransformObservation": lambda env: vector.TransformObservation(
+            env, lambda x: x[:, 0, :2], single_observation_space=box
+        ),
+        "TransformReward": lambda env: vector.TransformReward(env, lambda x: 2 * x),
+        "VectorizeTransformObservation": lambda env: vector.VectorizeTransformObservation(
+            env, gymnasium.wrappers.TransformObservation, func=lambda x: x[0, :2], observation_space=box
+        ),
+    }
+    return made
+
+
+def _bounded(vector, env):
+    import gymnasium
+
+    box = gymnasium.spaces.Box(-2, 2, (2, 8), np.float32)
+    inside = vector.TransformObservation(env, lambda x: x.clip(-2, 2), single_observation_space=box)
+    return vector.RescaleObservation(inside, -1, 1)
+
+
+REFUSES_SAME_STEP = r"Expected .*autoreset_mode.* to be"  # what gymnasium says
+
+
+def test_gymnasiums_own_wrappers_accept_it(vectors):
+    """All that gymnasium has, over the end of an episode; of `SameStep` those that gymnasium allows there."""
+    for name, wrap in wrappers_of_gymnasium().items():
+        for mode, env in vectors.items():
+            try:
+                wrapped = wrap(env)
+            except ValueError as error:
+                assert mode == "SameStep" and re.match(REFUSES_SAME_STEP, str(error)), (name, mode)
+                continue
+            obs, _ = wrapped.reset(seed=0)
+            assert obs in wrapped.observation_space, (name, mode)
+            ends_and_goes_on(wrapped)
+            for _ in range(2):
+                obs, *_ = wrapped.step(wrapped.action_space.sample())
+                assert obs in wrapped.observation_space, (name, mode)
+
+
+def test_a_client_may_write_to_every_array_without_changing_what_comes(vectors):
+    """`obs -= 1`, `reward[done] = 0` and the like are usual; a twin that is left alone shows the same afterwards."""
+    for mode, env in vectors.items():
+        twin = adapters.to_gymnasium(Fragile(), 3, autoreset_mode=mode)
+        returned, expected = [env.reset(seed=1)], [twin.reset(seed=1)]
+        for push in (1.0, 0.1, 0.2):
+            spoil(returned[-1])
+            returned.append(env.step(np.full((3, 2, 2), push)))
+            expected.append(twin.step(np.full((3, 2, 2), push)))
+        jax.tree.map(np.testing.assert_array_equal, returned[-1], expected[-1])
+    for make in (adapters.to_pettingzoo,):
+        parallel = make(Fragile())
+        returned = [parallel.reset(seed=1)]
+        spoil((returned[0], parallel.state()))
+        actions = dict.fromkeys(parallel.agents, np.full(2, 0.1))
+        spoil(parallel.step(actions))
+        before = parallel.state()
+        spoil(parallel.state())
+        np.testing.assert_array_equal(parallel.state(), before)
+
+
+def spoil(tree):
+    """Writes into every array; one that lies in another's memory would be seen."""
+    for x in jax.tree.leaves(tree):
+        if isinstance(x, np.ndarray):
+            x[...] = x == 0
+
+
+def check_vector(make):
+    """What gymnasium's `check_env` checks of a single environment, of a vector: spaces, seeds, dtypes, shapes."""
+    env, twin = make(), make()
+    assert env.observation_space.shape == (env.num_envs, *env.single_observation_space.shape)
+    assert env.action_space.shape == (env.num_envs, *env.single_action_space.shape)
+    for one in (env, twin):
+        one.action_space.seed(7)
+    first, _ = env.reset(seed=123, options={})
+    second, _ = twin.reset(seed=123)
+    np.testing.assert_array_equal(first, second)
+    assert env.np_random_seed == 123 and first in env.observation_space and first.dtype == env.observation_space.dtype
+    for _ in range(2 * HORIZON):
+        returned, others = (one.step(one.action_space.sample()) for one in (env, twin))
+        jax.tree.map(np.testing.assert_array_equal, returned, others)
+        obs, reward, terminated, truncated, info = returned
+        assert obs in env.observation_space and obs.dtype == env.observation_space.dtype
+        assert reward.shape == terminated.shape == truncated.shape == (env.num_envs,) and isinstance(info, dict)
+        assert np.issubdtype(reward.dtype, np.floating) and terminated.dtype == truncated.dtype == bool
+    assert (env.reset(seed=1)[0] != env.reset(seed=2)[0]).any()
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_gymnasium_keeps_what_its_checker_checks(mode: str):
+    pytest.importorskip("gymnasium")
+    check_vector(lambda: adapters.to_gymnasium(Fragile(), 2, autoreset_mode=mode))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("task", ["noisy", "switch", "ant_2x4", "velocity_hopper_3x1", "voltage_33"])
+def test_other_libraries_checkers_accept_the_tasks(task: str):
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+    env = envs.make(task)
+    vector = adapters.to_gymnasium(env, 2, autoreset_mode="NextStep")
+    obs, _ = vector.reset(seed=0)
+    for _ in range(3):
+        obs, *_ = vector.step(vector.action_space.sample())
+        assert obs in vector.observation_space
+    parallel_api_test(adapters.to_pettingzoo(env), num_cycles=30)
+    parallel_seed_test(lambda: adapters.to_pettingzoo(env), num_cycles=10)
+
+
 @pytest.mark.filterwarnings("error")
-def test_pettingzoo_passes_its_own_test():
+def test_pettingzoo_passes_its_own_tests():
     pytest.importorskip("pettingzoo")
-    from pettingzoo.test import parallel_api_test
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
 
     parallel_api_test(adapters.to_pettingzoo(envs.make("noisy")), num_cycles=60)
+    parallel_seed_test(lambda: adapters.to_pettingzoo(Fragile()), num_cycles=60)
+
+
+def refused(call) -> str:
+    """The sentence with which `call` is refused."""
+    with pytest.raises(envs.TaskError) as found:
+        call()
+    assert "\n" not in str(found.value)
+    return str(found.value)
+
+
+def test_what_adapters_refuse():
+    pytest.importorskip("pettingzoo")
+    lane = envs.make("lane")
+    for wrong in (0, -1, 2.5, "3"):
+        said = refused(functools.partial(adapters.to_gymnasium, lane, wrong))
+        assert "num_envs must be a whole number of at least 1" in said
+    said = refused(lambda: adapters.to_gymnasium(lane, 2, autoreset_mode="NEXT_STEP"))
+    assert "unknown autoreset_mode 'NEXT_STEP'" in said and "NextStep" in said
+    vector, parallel = adapters.to_gymnasium(lane, 2), adapters.to_pettingzoo(lane)
+    actions = dict.fromkeys(parallel.possible_agents, np.zeros(2))
+    for call in (lambda: vector.step(np.zeros((2, 2, 2))), lambda: parallel.step(actions), parallel.state):
+        assert "before reset" in refused(call)
+    vector.reset()
+    assert "(2, 2, 2), not (2, 2)" in refused(lambda: vector.step(np.zeros((2, 2))))  # which NumPy would stretch
+    assert "must be numbers" in refused(lambda: vector.step([["a"]]))
+    assert "reset_mask" in refused(lambda: vector.reset(options={"reset_mask": np.array([True, False])}))
+    parallel.reset()
+    assert "none of agent_1" in refused(lambda: parallel.step({"agent_0": np.zeros(2)}))
+    assert "action of agent_0 must have shape (2,)" in refused(
+        lambda: parallel.step(actions | {"agent_0": np.zeros(1)})
+    )
+    for _ in range(HORIZON):
+        assert parallel.agents
+        parallel.step(actions)
+    assert "the episode has ended" in refused(lambda: parallel.step(actions))
+    parallel.reset()
+    parallel.step(actions)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_a_pickled_gymnasium_environment_goes_on_where_it_was(mode: str):
+    pytest.importorskip("gymnasium")
+    env = adapters.to_gymnasium(Fragile(), 3, autoreset_mode=mode)
+    env = pickle.loads(pickle.dumps(env))  # before the first reset
+    env.reset(seed=2)
+    env.step(np.full((3, 2, 2), 1.0))  # ends all
+    copies = [env, pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    for push in (0.1, 0.9, 0.2):
+        found = [one.step(np.full((3, 2, 2), push)) for one in copies]
+        jax.tree.map(np.testing.assert_array_equal, found[0], found[1], found[2])
+    starts = [one.reset()[0] for one in copies]
+    np.testing.assert_array_equal(starts[0], starts[1])
+
+
+def test_a_pickled_pettingzoo_environment_goes_on_where_it_was():
+    pytest.importorskip("pettingzoo")
+    env = adapters.to_pettingzoo(envs.make("noisy"))
+    env.reset(seed=2)
+    other = pickle.loads(pickle.dumps(env))
+    for _ in range(3):
+        actions = dict.fromkeys(env.agents, np.full(2, 0.9))
+        jax.tree.map(np.testing.assert_array_equal, env.step(actions), other.step(actions))
+    np.testing.assert_array_equal(env.state(), other.state())
+
+
+@pytest.mark.parametrize("physics", ["fused", "mujoco"])
+def test_a_pickled_task_steps_as_the_task_does(physics: str):
+    try:
+        env = envs.make("velocity_hopper_3x1", physics=physics)
+    except envs.TaskError as error:
+        pytest.skip(str(error))
+    other = pickle.loads(pickle.dumps(env))
+    action = 0.3 * jnp.ones(env.spec.action_mask.shape)
+    found = []
+    for each in (env, other):
+        state = jax.jit(each.step)(each.reset(jax.random.key(0)), action)
+        found.append((state.obs, state.reward, state.cost, state.info))
+    jax.tree.map(np.testing.assert_array_equal, *found)
+
+
+def test_every_task_can_be_pickled():
+    for name in ("lane", "switch", "noisy", "voltage_33"):
+        pickle.loads(pickle.dumps(envs.make(name)))
+
+
+def test_spaces_have_the_dtypes_of_arrays_in_64_bits_too():
+    pytest.importorskip("pettingzoo")
+    code = """
+import envs, numpy as np
+from envs import adapters
+vector = adapters.to_gymnasium(envs.make("lane"), 2, autoreset_mode="NextStep")
+obs, info = vector.reset()
+assert obs.dtype == vector.observation_space.dtype == np.float64 and obs in vector.observation_space, obs.dtype
+obs, *_ = vector.step(vector.action_space.sample())
+assert obs.dtype == np.float64 and vector.action_space.dtype == np.float64
+parallel = adapters.to_pettingzoo(envs.make("lane"))
+obs, _ = parallel.reset()
+assert all(x in parallel.observation_space(agent) and x.dtype == np.float64 for agent, x in obs.items())
+assert parallel.state() in parallel.state_space and parallel.state().dtype == np.float64
+obs, *_ = parallel.step({agent: parallel.action_space(agent).sample() for agent in parallel.agents})
+assert obs["agent_0"].dtype == np.float64
+print("fine")
+"""
+    environment = {**os.environ, "JAX_ENABLE_X64": "1"}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert result.stdout == "fine\n", result.stderr
 
 
 def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
@@ -136,6 +430,9 @@ def test_jaxmarl_gets_what_the_task_says_and_a_new_episode_in_the_same_step():
         assert {bool(done) for done in dones.values()} == {bool(plain.terminated)}
     assert dones["__all__"] and not infos["truncated"].any() and infos["position"].shape == (2,)
     assert (obs["agent_0"][0] + 1) / 2 < 0.1  # where a new episode begins
+    np.testing.assert_array_equal(team.get_last_world_state(state), plain.global_state)  # before the reset
+    np.testing.assert_array_equal(jnp.stack(list(team.get_last_obs(state).values())), plain.obs)
+    assert team.get_world_state(state)[0] == obs["agent_0"][0] and team.world_state_size() == 6
 
 
 def test_jaxmarl_ends_with_the_time_limit_and_cuts_actions_that_an_agent_lacks():

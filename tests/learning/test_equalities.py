@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax import METHODS
+from envs.toys import Lane
+from pmt_jax import METHODS, load_config, make_train
 from pmt_jax.learning import fear, policies, regret, schedules
 from pmt_jax.learning.types import LearnerState, Tag
-from small import acted, differ, program, trained, weights
+from small import SMALL, acted, differ, program, trained, weights
 
 
 def holding(state: LearnerState, **changes: jax.Array) -> LearnerState:
@@ -26,6 +27,88 @@ def holding(state: LearnerState, **changes: jax.Array) -> LearnerState:
 def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
     lagrangian, _ = trained("mappo_l", lambda_init=0.0, lambda_lr=0.0)
     chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
+
+
+def test_a_penalty_of_weight_zero_makes_p3o_happo():
+    chex.assert_trees_all_close(weights(trained("p3o", lambda_max=0.0)[0]), weights(trained("happo")[0]), atol=1e-6)
+    assert differ(weights(trained("p3o")[0])["actor"], weights(trained("happo")[0])["actor"])
+
+
+@pytest.mark.full
+def test_the_order_is_a_switch_so_that_p3o_without_weight_is_mappo_too(monkeypatch: pytest.MonkeyPatch):
+    together = dataclasses.replace(METHODS["p3o"], order="simultaneous", share_actor=True)
+    monkeypatch.setitem(METHODS, "p3o_together", together)
+    without, _ = trained("p3o_together", lambda_max=0.0)
+    chex.assert_trees_all_close(weights(without), weights(trained("mappo")[0]), atol=1e-6)
+
+
+class Seen(Lane):
+    """`lane` of one agent that observes the global state and nothing else."""
+
+    def __init__(self):
+        super().__init__(num_agents=1)
+        self.spec = dataclasses.replace(self.spec, obs_dim=self.spec.state_dim)
+
+    def _state(self, *seen, **signals):
+        state = super()._state(*seen, **signals)
+        return dataclasses.replace(state, obs=state.global_state[None])
+
+
+@pytest.mark.full
+def test_ippo_of_one_agent_that_observes_the_state_is_mappo():
+    states = []
+    for method in ("ippo", "mappo"):
+        train = make_train(load_config("lane", method=method, **SMALL), Seen())
+        states.append(weights(jax.jit(train)(jax.random.key(0))[0]))
+    chex.assert_trees_all_close(*states, rtol=1e-5, atol=1e-6)
+
+
+def test_critics_of_observations_see_nothing_of_other_agents():
+    made = program("ippo_l")
+    state = made.init(made.setup.hyper, jax.random.key(0))
+    obs = jax.random.normal(jax.random.key(1), (3, 2, made.setup.vector.spec.obs_dim))
+    other = obs.at[:, 1].set(5.0)
+    nets = made.setup.nets
+    for net, value in ((state.critic, nets.value), (state.cost_critic, nets.cost_value)):
+        before, after = (value(net.net.params, x) for x in (obs, other))
+        assert before.shape[:2] == (3, 2)
+        np.testing.assert_array_equal(before[:, 0], after[:, 0])
+        assert jnp.abs(before[:, 1] - after[:, 1]).min() > 1e-6
+
+
+@pytest.mark.full
+def test_crpo_within_its_limit_is_happo():
+    within, metrics = trained("crpo", cost_limit=25.0)
+    chex.assert_trees_all_close(weights(within)["actor"], weights(trained("happo")[0])["actor"], atol=1e-6)
+    assert metrics["lambda"] == 0
+    beyond, metrics = trained("crpo", cost_limit=0.0)
+    assert metrics["lambda"] == 1 and differ(weights(beyond)["actor"], weights(within)["actor"])
+
+
+def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
+    setup, _, batch = acted()
+    setup = dataclasses.replace(setup, method=METHODS["crpo"])
+    reward, *cost = jax.random.normal(jax.random.key(2), (3, *batch.reward.shape))
+    none, chosen = jnp.zeros_like(batch.log_prob), jnp.asarray([[1.0], [0.0]])
+    rows = policies.policy_samples(setup, setup.hyper, chosen, batch, reward, jnp.stack(cost, -1)[..., None], none)
+    for advantage, expected in zip(rows.advantage, (-cost[0], reward), strict=True):
+        np.testing.assert_allclose(advantage, ((expected - expected.mean()) / expected.std()).ravel(), atol=1e-4)
+
+
+@pytest.mark.full
+def test_pid_pays_with_what_it_has_just_added_up_and_keeps_the_size_of_the_step():
+    gains = {"lambda_init": 0.5, "lambda_lr": 0.2, "lambda_kp": 0.5, "lambda_kd": 0.25}
+    made = program("mappo_pid")
+    state = made.init(made.hyper(**gains), jax.random.key(0))
+    integral, previous = 0.5, 0.0
+    for _ in range(3):
+        state, metrics = made.step(made.hyper(**gains), state)
+        excess = float(metrics["cost_excess"])
+        integral = max(integral + 0.2 * excess, 0.0)
+        price = integral + 0.5 * excess + 0.25 * max(excess - previous, 0.0)
+        np.testing.assert_allclose(metrics["lambda"], price, rtol=1e-4)
+        previous = excess
+    np.testing.assert_allclose(state.constraint.multiplier, integral, rtol=1e-4)
 
 
 @pytest.mark.full

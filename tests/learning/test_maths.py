@@ -15,7 +15,15 @@ from scipy import stats
 from pmt_jax.learning import constraint
 from pmt_jax.learning.maths import distributions, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
-from pmt_jax.learning.maths.losses import clipped_surrogate, huber, hybrid_advantage, value_loss
+from pmt_jax.learning.maths.losses import (
+    FOCOPS_TEMPERATURE,
+    clipped_penalty,
+    clipped_surrogate,
+    first_order_surrogate,
+    huber,
+    hybrid_advantage,
+    value_loss,
+)
 from pmt_jax.learning.networks import LayerNorm
 from pmt_jax.learning.optimise import fit, init_train_state, shuffled
 
@@ -259,6 +267,52 @@ def test_kl_and_its_derivatives_at_equal_parameters():
 def test_kl_against_the_textbook():
     kl = distributions.kl(jnp.asarray([1.0]), jnp.asarray([0.5]), jnp.asarray([0.0]), jnp.asarray([2.0]), jnp.ones(1))
     np.testing.assert_allclose(kl, np.log(4) + (0.25 + 1) / 8 - 0.5, rtol=1e-5)
+
+
+def penalty(ratio: list[float], cost: list[float], excess: float, factor: float = 1.0) -> float:
+    log_ratio = jnp.log(jnp.asarray(ratio))
+    none = jnp.zeros_like(log_ratio)
+    cost_advantage, excesses = column(cost), jnp.asarray([excess])
+    return float(clipped_penalty(log_ratio, none, cost_advantage, none + factor, excesses, 0.2))
+
+
+def test_a_penalty_is_clipped_towards_the_worse_and_only_beyond_the_limit():
+    assert penalty([1.0, 1.0], [1.0, -1.0], -0.1) == 0  # within
+    np.testing.assert_allclose(penalty([1.0, 1.0], [1.0, -1.0], 0.3), 0.3, rtol=1e-6)
+    np.testing.assert_allclose(penalty([1.5, 1.0], [1.0, 0.0], 0.0), 0.75, rtol=1e-6)  # what costs more is not clipped
+    np.testing.assert_allclose(penalty([0.5, 1.0], [1.0, 0.0], 0.0), 0.4, rtol=1e-6)  # less of it counts to 0.8
+    np.testing.assert_allclose(penalty([1.5, 1.0], [-1.0, 0.0], 1.0), 0.4, rtol=1e-6)
+    np.testing.assert_allclose(penalty([1.5, 1.0], [1.0, 0.0], 0.0, factor=2.0), 1.5, rtol=1e-6)
+
+
+def test_a_penalty_of_two_costs_counts_each_alone():
+    none = jnp.zeros(2)
+    both = clipped_penalty(none, none, jnp.zeros((2, 2)), none + 1, jnp.asarray([0.5, -9.0]), 0.2)
+    np.testing.assert_allclose(both, 0.5)
+
+
+def test_focops_stands_still_at_the_best_policy_of_its_trust_region():
+    """Of a Gaussian with the advantage g (a - m), pi exp(A / tau) / Z is the same Gaussian moved by g std^2 / tau."""
+    std, slope = 0.4, 0.3
+    noise = std * stats.norm.ppf((np.arange(4000) + 0.5) / 4000)  # quantiles in place of samples
+    action, one = jnp.asarray(noise, jnp.float32)[:, None], jnp.ones(1)
+
+    def objective(mean: jax.Array, kl_limit: float = jnp.inf) -> jax.Array:
+        old, new = ((jnp.full(1, m), jnp.full(1, std)) for m in (0.0, mean))
+        log_ratio = distributions.log_prob(action, *new, one) - distributions.log_prob(action, *old, one)
+        kl = jnp.broadcast_to(distributions.kl(*new, *old, one), log_ratio.shape)
+        none = jnp.zeros_like(log_ratio)
+        return first_order_surrogate(log_ratio, none, slope * action[:, 0], none + 1, kl, kl_limit).mean()
+
+    best = slope * std**2 / FOCOPS_TEMPERATURE
+    np.testing.assert_allclose(jax.grad(objective)(0.0), slope / FOCOPS_TEMPERATURE, rtol=1e-2)
+    np.testing.assert_allclose(jax.grad(objective)(best), 0.0, atol=2e-3)
+    assert jax.grad(objective)(2 * best) < -0.1 and jax.grad(objective)(2 * best, 1e-6) == 0
+
+
+def test_crpo_improves_the_cost_furthest_beyond_its_limit_or_the_reward():
+    chosen = constraint.switching(jnp.asarray([[0.1, 0.3], [-0.1, 0.2], [-0.2, -0.1], [0.0, -0.1]]))
+    np.testing.assert_array_equal(chosen, [[0, 1], [0, 1], [0, 0], [0, 0]])
 
 
 def test_fit_finds_the_least_squares_solution_and_sees_every_row_in_each_epoch():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import pathlib
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 
 from pmt_jax import load_config, load_policy, make_setup
 from pmt_jax.learning.maths import running_moments
-from pmt_jax.policies import load, numpy_policy
+from pmt_jax.policies import load, numpy_policy, onnx_policy
 from pmt_jax.policies.export import weights
 
 
@@ -47,6 +48,39 @@ def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     np.testing.assert_allclose(json.loads(alone.stdout), expected, rtol=1e-5, atol=1e-6)
 
 
+def test_a_policy_exported_as_onnx(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    code, text, _ = cli("export", whole, "-o", tmp_path, "--seed", 1, "--onnx")
+    assert code == 0 and "numpy_policy.py and policy.onnx into" in text
+    session = runtime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    for batch in (1, 5):
+        obs = 3 * np.asarray(jax.random.normal(jax.random.key(batch), (batch, 2, 8)))
+        (found,) = session.run(["action"], {"obs": obs})
+        np.testing.assert_allclose(found, jax.vmap(load_policy(whole, seed=1))(obs), rtol=1e-5, atol=1e-5)
+
+
+def test_an_onnx_policy_that_differs_is_refused(tmp_path: pathlib.Path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    run = make_setup(load_config("lane", hidden=[8]))
+    made = weights(run, run.nets.init_actor(jax.random.key(0)), running_moments.init((8,)))
+    onnx_policy.write(made, tmp_path / "policy.onnx")
+    np.savez(tmp_path / "policy.npz", **made)
+    obs = np.ones((3, 2, 8), np.float32)
+    action = numpy_policy.load(tmp_path / "policy.npz")(obs)
+    onnx_policy.check(tmp_path / "policy.onnx", obs, action)
+    with pytest.raises(ValueError, match="differ from the policy's by 0.001"):
+        onnx_policy.check(tmp_path / "policy.onnx", obs, action + 1e-3)
+
+
+def test_onnx_without_its_extra(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    code, _, error = cli("export", whole, "-o", tmp_path / "out", "--onnx")
+    assert code == 2 and "this needs onnx, which is missing here: pip install 'pmt-jax[onnx]'" in error
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -65,3 +99,7 @@ def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pat
     obs = 5 * jax.random.normal(jax.random.key(2), (4, 3, 2, 8))
     expected = run.nets.policies(params, run.scale(moments, obs))[0]
     np.testing.assert_allclose(numpy_policy.load(tmp_path / "policy.npz")(obs), expected, rtol=2e-5, atol=2e-5)
+    if all(map(importlib.util.find_spec, ("onnx", "onnxruntime"))):
+        onnx_policy.write(weights(run, params, moments), tmp_path / "policy.onnx")
+        obs, expected = (np.asarray(x).reshape(12, 2, -1) for x in (obs, expected))
+        onnx_policy.check(tmp_path / "policy.onnx", obs, expected)

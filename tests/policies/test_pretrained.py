@@ -60,6 +60,17 @@ def untrained(out: pathlib.Path, last: tuple[float, float], best: tuple[float, f
     return out
 
 
+def test_what_training_reached_stands_beside_what_a_policy_reaches(tmp_path: pathlib.Path):
+    """Over the last tenth of the steps of its seed, each agent by its own limit."""
+    row = {"seed": 3, "cost_limit": 1.0, "episode_reward": 5.0, "episode_cost": 0.75}
+    row |= {"episode_cost/agent_0": 1.5, "episode_cost/agent_1": 0.0, "episode_cost_worst": 1.5}
+    rows = [row | {"step": step, "episode_reward": float(step)} for step in range(10, 201, 10)]
+    rows += [row | {"step": 200, "seed": 4, "episode_reward": 0.0}, row | {"step": 190, "episode_reward": None}]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(each) + "\n" for each in rows))
+    assert publish.trained(tmp_path, 3) == {"episode_reward": 195.0, "episode_cost": 1.5, "within": False}
+    assert publish.trained(tmp_path, 5) is None and publish.trained(tmp_path / "none", 3) is None
+
+
 @pytest.mark.full
 def test_the_best_policy_of_a_run_is_published_and_used_by_name(empty_hub: pathlib.Path, tmp_path: pathlib.Path, cli):
     # The lane's point comes to rest at twice the push; beyond 0.5 it costs, the nearer to 1 the better.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pathlib
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,7 +60,42 @@ def test_every_step_of_an_evaluation_can_be_saved(whole: pathlib.Path, tmp_path:
     push = np.clip(steps["action"][..., 1:, :, :], -1, 1)
     np.testing.assert_allclose(after, 0.8 * now + 0.1 * push.sum((-1, -2)), atol=1e-5)  # the task's own dynamics
     refused = cli("eval", whole, "--save", "x.csv")
-    assert refused[::2] == (2, "pmt: cannot write x.csv: its ending must be .npz\n")
+    assert refused[::2] == (2, "pmt: cannot write x.csv: its ending must be .npz, or its beginning minari:\n")
+
+
+def test_an_evaluation_is_a_data_set_of_minari(
+    whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch
+):
+    minari = pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    code, text, _ = cli("eval", whole, "--episodes", 3, "--save", "minari:lane/team-v0")
+    assert code == 0 and text.endswith("wrote every step to minari:lane/team-v0\n")
+    assert cli("eval", whole, "--episodes", 3, "--save", tmp_path / "episodes.npz")[0] == 0
+    steps, dataset = np.load(tmp_path / "episodes.npz"), minari.load_dataset("lane/team-v0")
+    episodes = list(dataset)
+    assert dataset.total_steps == steps["length"].sum() == 150 and len(episodes) == 6
+    for k, episode in enumerate(episodes):
+        i, j = divmod(k, 3)
+        np.testing.assert_array_equal(episode.observations[:-1], steps["obs"][i, j])
+        np.testing.assert_array_equal(episode.observations[-1], steps["final_obs"][i, j])
+        np.testing.assert_array_equal(episode.actions, steps["action"][i, j])
+        np.testing.assert_array_equal(episode.rewards, steps["reward"][i, j])
+        np.testing.assert_array_equal(episode.infos["cost"], steps["cost"][i, j])
+        np.testing.assert_array_equal(episode.infos["position"], steps["info/position"][i, j])
+        assert (episode.infos["seed"] == i).all() and episode.truncations[-1] and not episode.truncations[:-1].any()
+        # The last observation is of where the last action led, not of the next episode.
+        np.testing.assert_allclose(episode.observations[-1, 0, 0], 2 * episode.infos["position"][-1] - 1, atol=1e-6)
+    again = cli("eval", whole, "--save", "minari:lane/team-v0")
+    assert again[0] == 2 and "there is such a Minari data set; choose another name or version" in again[2]
+    for name in ("minari:", "minari:a b", "minari:lane/team"):
+        assert "a Minari data set is called like minari:lane/mappo_l-v0" in cli("eval", whole, "--save", name)[2]
+
+
+def test_minari_without_its_extra(whole: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    code, _, error = cli("eval", whole, "--save", "minari:lane/team-v0")
+    assert code == 2 and "this needs minari, which is missing here: pip install 'pmt-jax[minari]'" in error
 
 
 def test_steps_after_the_end_of_an_episode_are_zero(tmp_path: pathlib.Path, cli):

@@ -9,10 +9,13 @@ import pathlib
 import subprocess
 import sys
 import threading
+import types
+from typing import Any
 
 import pytest
 
 from envs.base import Declarations
+from envs.physics import kernels_of
 from pmt_jax import tasks
 from pmt_jax.training import compile
 from runs import ARGUMENTS, environment
@@ -60,6 +63,13 @@ def test_only_warp_has_kernels(cli, tmp_path):
         assert not tasks.declarations(env).kernels()
     code, text, _ = cli("train", *ARGUMENTS, "--steps", 200, "--out", tmp_path / "run")
     assert code == 0 and " kernels ready" not in text
+
+
+def test_a_task_needs_the_kernels_of_all_its_engines():
+    def engine(*kernels: int) -> Any:
+        return types.SimpleNamespace(kernels=lambda: kernels)
+
+    assert kernels_of(engine(1, 2), object(), engine(3)) == [1, 2, 3]  # the second has none, as all but warp
 
 
 @pytest.mark.full

@@ -6,12 +6,13 @@ import csv
 import io
 import pathlib
 import sys
+import threading
 import types
 
 import pytest
 from rich.console import Console
 
-from pmt_jax.training import metrics
+from pmt_jax.training import metrics, progress
 from pmt_jax.training.progress import COLUMNS, Progress
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
@@ -91,6 +92,37 @@ def test_a_narrow_terminal_shows_fewer_columns_whole(width: int):
     assert (all(name in text for name in COLUMNS)) == (width == 200)
     assert ("episode reward" in text and "1234.5" in text) == (width >= 40)
     assert ("98,765" in text) == (width >= 60)
+
+
+def test_a_terminal_gets_one_row_every_few_seconds_and_always_the_newest(monkeypatch: pytest.MonkeyPatch):
+    """400 chunks in 9 s were 400 rows; the last row is replaced instead until it is old enough."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    console = Console(file=io.StringIO(), width=120, force_terminal=True)
+    shown = progress.Progress(total=10_000, console=console, every=5.0)
+    for step in range(1, 73):  # eight a second
+        now[0] = step / 8
+        shown.show([{"step": step, "cost_limit": 1.0}], 10.0)
+    assert [cells[0] for cells in shown._history] == ["40", "72"]
+    shown.close()
+
+
+def test_what_takes_long_says_that_it_is_alive():
+    """While nothing else is printed, and never after it has ended."""
+    said: list[str] = []
+    spoken = threading.Event()
+
+    def note(line: str) -> None:
+        said.append(line)
+        spoken.set()
+
+    with progress.alive("compiling", note, first=0.001, longest=0.001):
+        assert spoken.wait(60)
+    count = len(said)
+    assert said[0].startswith("compiling: ") and said[0].endswith(" so far ...")
+    with progress.alive("compiling", note):
+        pass
+    assert len(said) == count
 
 
 def test_a_pipe_gets_a_line(capsys):

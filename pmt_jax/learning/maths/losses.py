@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import optax
 
 SMOOTHING = 0.01
+FOCOPS_TEMPERATURE = 1.5  # the paper's, for all tasks
 
 
 def hybrid_advantage(advantage: jax.Array, cost_advantage: jax.Array, multiplier: jax.Array) -> jax.Array:
@@ -37,6 +38,50 @@ def clipped_surrogate(
     """
     ratio = jnp.exp(log_ratio + log_weight)
     return factor * jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
+
+
+def clipped_penalty(
+    log_ratio: jax.Array,
+    log_weight: jax.Array,
+    cost_advantage: jax.Array,
+    factor: jax.Array,
+    excess: jax.Array,
+    clip: jax.Array | float,
+) -> jax.Array:
+    """P3O's exact penalty: sum_k max(0, mean(M max(rho A_c, clip(rho, 1 - eps, 1 + eps) A_c)) + S), [].
+
+    The surrogate of a cost is clipped towards the worse, as the reward's is, and counts only where it is beyond the
+    limit (Zhang et al., 2022, section 4; Theorem 1: exact once its weight is at least the optimal multiplier).
+
+    Args:
+      log_ratio, log_weight, factor: [R], see `clipped_surrogate`; clip: eps.
+      cost_advantage: [R, K], centred; excess: [K], S in cost per step; the two in one unit, like a standard deviation.
+    """
+    ratio = jnp.exp(log_ratio + log_weight)[:, None]
+    each = jnp.maximum(ratio * cost_advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * cost_advantage)
+    return jnp.maximum((factor[:, None] * each).mean(0) + excess, 0.0).sum()
+
+
+def first_order_surrogate(
+    log_ratio: jax.Array,
+    log_weight: jax.Array,
+    advantage: jax.Array,
+    factor: jax.Array,
+    kl: jax.Array,
+    kl_limit: jax.Array | float,
+) -> jax.Array:
+    """FOCOPS's objective per row, to be maximised: M rho A / tau - KL(pi || pi_old) where that is within the bound.
+
+    Its gradient is that of the divergence from the best policy of a trust region without parameters, which is
+    pi_old exp(A / tau) / Z (Zhang et al., 2020, Theorem 1 and Corollary 1, with tau their lambda). Rows whose policy
+    has already moved by more than `kl_limit` have no gradient (the indicator of their Algorithm 1).
+
+    Args:
+      log_ratio, log_weight, factor: [R], see `clipped_surrogate`; advantage: [R], A = A_r - sum_k nu_k A_c,k.
+      kl: [R], KL(pi || pi_old) in nats; kl_limit: their delta, in nats.
+    """
+    gain = factor * jnp.exp(log_ratio + log_weight) * advantage / FOCOPS_TEMPERATURE
+    return jnp.where(kl <= kl_limit, gain - kl, 0.0)
 
 
 def huber(error: jax.Array, delta: float = 10.0) -> jax.Array:

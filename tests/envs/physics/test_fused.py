@@ -19,12 +19,13 @@ import numpy as np
 import pytest
 
 import envs
-from envs import physics
+from envs import native, physics
 from envs.ant import walls
 from envs.errors import TaskError
 from envs.physics.contract import PhysicsState
-from envs.physics.fused import cpu, header
+from envs.physics.fused import cpu
 from envs.physics.fused import model as tables_of
+from envs.physics.fused.header import header
 from envs.physics.fused_engine import FusedEngine
 from native import compiled
 from paths import ROOT
@@ -412,14 +413,18 @@ def fresh(monkeypatch, tmp_path):
     (tmp_path / "cache").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setattr(cpu.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(cpu, "_failures", [])
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(native, "_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(native, "_failures", {})
     return tmp_path / "bin"
 
 
+def small_code(*bodies: str) -> native.Code:
+    return cpu.code(header(tables_of.tables(small(*bodies), 1, {})))
+
+
 def real_compiler() -> str:
-    return next(cpu.compilers()).command[0]
+    return next(native.compilers()).command[0]
 
 
 def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli):
@@ -440,10 +445,10 @@ def test_compilers_are_asked_in_the_order_of_the_readme(fresh, monkeypatch):
     (fresh.parent / "ziglang").mkdir()
     script(fresh.parent / "ziglang", "zig", 'if [ "$2" = --version ]; then echo "clang of zig"; fi')
     place = types.SimpleNamespace(submodule_search_locations=[str(fresh.parent / "ziglang")])
-    monkeypatch.setattr(cpu.importlib.util, "find_spec", lambda name: place)
-    found = [[pathlib.Path(compiler.command[0]).name, *compiler.command[1:]] for compiler in cpu.compilers()]
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: place)
+    found = [[pathlib.Path(compiler.command[0]).name, *compiler.command[1:]] for compiler in native.compilers()]
     assert found == [["mine", "-pipe"], ["c++"], ["g++"], ["clang++"], ["zig", "c++"]]
-    assert [compiler.version for compiler in cpu.compilers()] == 4 * ["fake 1.0"] + ["clang of zig"]
+    assert [compiler.version for compiler in native.compilers()] == 4 * ["fake 1.0"] + ["clang of zig"]
 
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, HANGING], ids=["fails", "writes garbage", "hangs"])
@@ -455,7 +460,7 @@ def test_compilers_that_do_not_work_end_in_mujoco_and_a_sentence(fresh, text, mo
     assert "could not be compiled" in tasks.advice(env) and "c++" in tasks.advice(env)
     with pytest.raises(TaskError, match="physics 'fused' could not be compiled"):
         envs.make("ant_2x4", physics="fused")
-    assert not list(cpu._folder().iterdir()), "it left something behind"
+    assert not list(native._folder().iterdir()), "it left something behind"
 
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, "exit 1"], ids=["fails", "writes garbage", "is no compiler"])
@@ -463,41 +468,41 @@ def test_after_a_compiler_that_does_not_work_the_next_one_is_taken(fresh, text, 
     monkeypatch.undo()
     compiler = real_compiler()
     monkeypatch.setenv("CXX", str(script(fresh, "mine", text)))
-    monkeypatch.setattr(cpu, "_folder", lambda: fresh.parent / "cache")
+    monkeypatch.setattr(native, "_folder", lambda: fresh.parent / "cache")
     lines = []
     with tasks.announcing(lines.append):
-        path = cpu.library(tables_of.tables(small(), 1, {}))
+        path = native.library(small_code())
     assert path.exists() and lines[-1] == f"compiling the physics ({compiler}) ..."
     with tasks.announcing(lines.append):
-        assert cpu.library(tables_of.tables(small(), 1, {})) == path
+        assert native.library(small_code()) == path
     assert lines[-1] != f"compiling the physics ({compiler}) ..." or len(lines) <= 2
 
 
 def test_the_key_of_the_cache_has_all_that_the_library_depends_on(monkeypatch):
-    compiler, text = next(cpu.compilers()), "tables"
-    keys = [cpu._key(compiler, text, "double"), cpu._key(compiler, "other tables", "double")]
-    keys += [cpu._key(compiler, text, "float"), cpu._key(compiler._replace(version="2"), text, "double")]
-    monkeypatch.setattr(cpu, "cpu_flags", lambda: "of another CPU")
-    keys.append(cpu._key(compiler, text, "double"))
+    compiler, code = next(native.compilers()), cpu.code("tables", "double")
+    keys = [native._key(compiler, code), native._key(compiler, cpu.code("other tables", "double"))]
+    keys += [native._key(compiler, cpu.code("tables", "float")), native._key(compiler._replace(version="2"), code)]
+    monkeypatch.setattr(native, "cpu_flags", lambda: "of another CPU")
+    keys.append(native._key(compiler, code))
     monkeypatch.setattr(jax.lib, "__version__", "0.0.1")
-    keys.append(cpu._key(compiler, text, "double"))
+    keys.append(native._key(compiler, code))
     assert len(set(keys)) == len(keys)
 
 
 @pytest.fixture(scope="module")
 def small_library() -> pathlib.Path:
-    return cpu.library(tables_of.tables(small(), 1, {}))
+    return native.library(small_code())
 
 
 def test_a_library_of_another_cpu_is_not_taken(small_library, fresh, monkeypatch, tmp_path):
     """As where a home is shared by machines: each finds its own."""
-    made = tables_of.tables(small(), 1, {})
+    made = small_code()
     copy = f'while [ "$1" != -o ]; do shift; done; /bin/cp {small_library} "$2"; echo >> {tmp_path}/count'
     script(fresh, "c++", SAYS_WHAT_IT_IS + copy)
     found = []
     for flags in ("avx2", "avx512f", "avx2"):
-        monkeypatch.setattr(cpu, "cpu_flags", lambda flags=flags: flags)
-        found.append(cpu.library(made))
+        monkeypatch.setattr(native, "cpu_flags", lambda flags=flags: flags)
+        found.append(native.library(made))
     assert found[0] == found[2] != found[1] and (tmp_path / "count").read_text() == "\n\n"
 
 
@@ -506,27 +511,33 @@ def test_a_library_of_another_cpu_is_not_taken(small_library, fresh, monkeypatch
 def test_it_compiles_for_aarch64(robot, tmp_path):
     """By a cross compiler, or by zig, where there is one; nothing here can run it."""
     cross = shutil.which("aarch64-linux-gnu-g++")
-    zig = next((c.command for c in cpu.compilers() if c.command[-1] == "c++" and "zig" in c.command[0]), None)
+    zig = next((c.command for c in native.compilers() if c.command[-1] == "c++" and "zig" in c.command[0]), None)
     if not cross and not zig:
         pytest.skip("no compiler for aarch64 here")
     model, substeps = model_of(robot)
-    (tmp_path / "model.h").write_text(header.header(tables_of.tables(model, substeps, readout_of(model))))
+    (tmp_path / "model.h").write_text(header(tables_of.tables(model, substeps, readout_of(model))))
     chosen = [cross] if cross else [*zig, "-target", "aarch64-linux-gnu", "-nostdlib++"]
-    paths = ["-isystem", jax.ffi.include_dir(), f"-I{tmp_path}", f"-I{cpu.HERE}", str(cpu.HERE / "lanes.cpp")]
+    paths = [
+        "-isystem",
+        jax.ffi.include_dir(),
+        f"-I{tmp_path}",
+        f"-I{cpu.HERE}",
+        f"-I{native.HEADER.parent}",
+        str(cpu.HERE / "lanes.cpp"),
+    ]
     out = tmp_path / "step.so"
-    command = [*chosen, *cpu._FLAGS, "-DREAL=double", '-DMODEL="model.h"', *paths, "-o", str(out)]
+    command = [*chosen, *native._FLAGS, "-DREAL=double", '-DMODEL="model.h"', *paths, "-o", str(out)]
     subprocess.run(command, check=True, env=os.environ | {"ZIG_GLOBAL_CACHE_DIR": str(tmp_path / "zig")})
     machine = int.from_bytes(out.read_bytes()[18:20], "little")
     assert machine == 183  # EM_AARCH64
 
 
 def test_a_damaged_library_is_compiled_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path)
-    made = tables_of.tables(small("<body><joint/><geom size='.2'/></body>"), 1, {})
-    path = cpu.library(made)
-    path.unlink()  # the process has it open
+    monkeypatch.setattr(native, "_folder", lambda: tmp_path)
+    made = small_code("<body><joint/><geom size='.2'/></body>")
+    path = native.library(made)
     path.write_bytes(b"half a libr")
-    assert cpu.library(made) == path and path.stat().st_size > 1000
+    assert native.library(made) == path and path.stat().st_size > 1000
 
 
 STEP = """

@@ -1,0 +1,93 @@
+"""What the end of a run says of its limit: by how many seeds it was kept, and what to do where it was not."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..config.methods import METHODS
+from .run_log import RunLog, read
+
+NEAR = 2.0  # times the limit: costs that were never so low never came near it
+FALLING = 0.05  # share by which costs fell between the last two tenths of the steps, if they still fall
+AT_BOUND = 0.98  # share of lambda_max
+
+
+def lines(folder: pathlib.Path) -> list[str]:
+    """One to three lines about the run in `folder`, which has ended; none if it has no metrics."""
+    log = read(folder, note=lambda _: None)
+    if log is None:
+        return []
+    by_training, deployed = log.excess, log.deployed
+    by_mean = None if deployed is None else deployed.excess
+    said = [_kept(log, by_training, by_mean)]
+    beyond = [i for i, x in enumerate(by_training) if x > 0]
+    if beyond:
+        said.append(_advice(log, beyond))
+    if beyond and by_mean is not None and not (by_mean > 0).any() and np.isfinite(by_mean).all():
+        said.append("what is deployed acts without noise and keeps the limit")
+    elif not beyond and by_mean is not None and (by_mean > 0).any():
+        said.append("mean actions are beyond it where sampled ones are not: raise --cost-margin, or deploy with noise")
+    return said
+
+
+def _kept(log: RunLog, by_training: np.ndarray, by_mean: np.ndarray | None) -> str:
+    source = "evaluations" if log.evaluated else "training episodes, with noise"
+    parts = [_count(by_training, f"in the last tenth of the steps ({source})")]
+    if by_mean is not None:
+        parts.append(_count(by_mean, "under mean actions"))
+    return f"limit {log.limits}: kept {'; '.join(parts)}"
+
+
+def _count(excess: np.ndarray, where: str) -> str:
+    seeds = "seeds" if len(excess) > 1 else "seed"
+    worst = np.max(excess, initial=-np.inf, where=np.isfinite(excess))
+    far = f", the worst {worst:.3g} beyond" if worst > 0 else ""
+    return f"by {int((excess <= 0).sum())} of {len(excess)} {seeds} {where}{far}"
+
+
+def _advice(log: RunLog, beyond: Sequence[int]) -> str:
+    """The first reason that applies to a seed beyond the limit, and what to do."""
+    constraint = _constraint(log)
+    if constraint == "none":
+        return f"{log.method} has no constraint; train one that has: --method mappo_l or f4sg"
+    limit, seeds = log.limits.total, ", ".join(str(log.seeds[i]) for i in beyond)
+    whose = f"seed{'s' * (len(beyond) > 1)} {seeds}"
+    bound = log.settings.get("lambda_max", np.inf)
+    if constraint == "lagrangian" and (_multiplier(log)[beyond] >= AT_BOUND * bound).any():
+        return f"{whose}: the multiplier is at its bound, lambda_max = {bound:g}; raise --lambda-max"
+    cost = log.metrics["episode_cost"][beyond]
+    before, last = (_mean(cost, log.steps, begin) for begin in (0.8, 0.9))
+    if np.any(before - last > FALLING * np.abs(before)):
+        more = f"--steps {2 * int(log.steps[-1]):g} --out {log.folder} --resume"
+        return (
+            f"{whose}: costs were still falling ({np.nanmean(before):.3g} to {np.nanmean(last):.3g}); train on: {more}"
+        )
+    lowest = np.nanmin(cost, initial=np.inf)
+    if lowest > NEAR * limit:
+        stronger = "--lambda-lr" if constraint == "lagrangian" else "--limit-lr"
+        return f"{whose}: costs never came near the limit (lowest row {lowest:.3g}); raise {stronger}, or train longer"
+    return f"{whose}: costs stay about the limit; --cost-margin 0.2 holds them below it"
+
+
+def _constraint(log: RunLog) -> str:
+    """The method's; of one that is not in the table, what its metrics show."""
+    if log.method in METHODS:
+        return METHODS[log.method].constraint
+    return "trust_region" if "limit_lowered" in log.metrics else "lagrangian" if np.any(_multiplier(log)) else "none"
+
+
+def _multiplier(log: RunLog) -> np.ndarray:
+    """[S] the largest multiplier of any agent at the end; nan if the method has none."""
+    each = [x for name, x in log.metrics.items() if name == "lambda" or name.startswith("lambda/")]
+    return np.max([_mean(x, log.steps, 0.9) for x in each], axis=0) if each else np.full(len(log.seeds), np.nan)
+
+
+def _mean(values: np.ndarray, steps: np.ndarray, begin: float) -> np.ndarray:
+    """[S] means over a tenth of the steps that begins at a share of them; nan where nothing is known."""
+    chosen = values[:, (steps > begin * steps[-1]) & (steps <= (begin + 0.1) * steps[-1] + 0.5)]
+    known = np.isfinite(chosen)
+    total = np.where(known, chosen, 0.0).sum(1)
+    return np.where(known.any(1), total / np.maximum(known.sum(1), 1), np.nan)

@@ -1,0 +1,62 @@
+"""What can be known of a limit before training: that these settings cannot hold costs to it in these steps."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+
+from ..config.methods import label
+from ..learning import constraint
+from ..learning.setup import Setup
+from ..limits import Limits
+
+LITTLE = 1.5  # times what it began as: a multiplier that grows by less has hardly moved
+
+
+def notes(setup: Setup) -> list[str]:
+    """A sentence for each reason why the limit that was asked for may not be kept; none if the task's own is used."""
+    config, spec = setup.config, setup.vector.spec
+    given, method = Limits.configured(config, spec.num_costs), label(config.method)
+    if given is None or setup.trials is not None:
+        return []
+    if setup.method.constraint == "none":
+        return [f"note: {method} has no constraint, so cost_limit = {given} is only reported; take mappo_l or f4sg"]
+    found = []
+    if 0 in given.each:
+        found.append(
+            f"note: no cost is below a limit of 0, so what {method} does against costs can only grow and the "
+            "reward will suffer; a small limit above 0 can be met from below"
+        )
+    steps, horizon = config.num_updates * config.rollout_length, setup.vector.horizon
+    if config.cost_estimate == "episode" and steps < horizon:
+        found.append(
+            f"note: {config.num_envs} environments make {steps:,} steps each, less than the {horizon:,} of an episode, "
+            "so its cost is hardly ever measured; raise --steps or lower --num-envs"
+        )
+    elif setup.method.constraint == "lagrangian" and min(given.each) > 0:
+        found += _of_multiplier(setup, given)
+    return found
+
+
+def _of_multiplier(setup: Setup, given: Limits) -> list[str]:
+    """Whether costs of twice the limit, in every update of the run, would move the multiplier."""
+    config, hyper = setup.config, setup.hyper
+    costs, horizon = jnp.asarray(given.each, jnp.float32), setup.vector.horizon
+    excess = constraint.cost_excess(2 * costs, constraint.target(hyper), horizon)
+    share = float(jnp.min(constraint.excess_in_lambda_unit(setup, hyper, excess)))
+    begin, rate, gain = config.lambda_init, config.lambda_lr, config.lambda_kp * share
+    if config.lambda_unit == "relative":
+        end = begin * math.exp(min(50.0, rate * share * config.num_updates))
+    else:
+        end = begin + rate * share * config.num_updates
+    if min(end, config.lambda_max) + gain >= LITTLE * max(begin, 0.1):
+        return []
+    if config.lambda_max < LITTLE * begin:
+        return [f"note: the multiplier begins at {begin:g} and may not exceed lambda_max = {config.lambda_max:g}"]
+    enough = (LITTLE * max(begin, 0.1)) / max(share * config.num_updates, 1e-30)
+    return [
+        f"note: with costs of twice the limit of {given}, the multiplier would move from {begin:g} to {end:.3g} in all "
+        f"{config.num_updates:,} updates, too little to matter; raise --lambda-lr (now {rate:g}) to {enough:.2g} or "
+        "more, or train for more --steps"
+    ]

@@ -1,0 +1,196 @@
+"""Every run ends with an evaluation under mean actions, and with lines that say whether the limit was kept."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import signal
+
+import numpy as np
+import pytest
+
+from pmt_jax import load_config
+from pmt_jax.learning.setup import make_setup
+from pmt_jax.studies import run_log, verdict
+from pmt_jax.training import final, outlook, trainer
+from runs import ARGUMENTS, STEPS, assert_same_run
+
+
+def ends(out: pathlib.Path) -> list[dict]:
+    return [json.loads(line) for line in (out / final.FILE).read_text().splitlines()]
+
+
+def test_the_end_of_a_run_is_what_eval_measures(whole: pathlib.Path, cli):
+    """Seed for seed, figure for figure; and every row of the table has both measures, named and defined."""
+    code, text, _ = cli("eval", whole, "--episodes", final.EPISODES, "--deterministic")
+    measured = [line.split() for line in text.splitlines() if line.startswith("  ")]
+    found = ends(whole)
+    assert code == 0 and [row["seed"] for row in found] == [0, 1] and {row["step"] for row in found} == {STEPS}
+    assert {row["episodes"] for row in found} == {64} and {row["actions"] for row in found} == {"mean"}
+    for name in ("episode_reward", "episode_cost", "violation_rate", "within_limit"):
+        theirs = [float(words[1]) for words in measured if words[0] == name]
+        np.testing.assert_allclose([row[name] for row in found], theirs, atol=1e-4)
+    text = cli("table", whole)[1]
+    for part in ("mean-action reward", "mean-action cost", "mean-action seeds within", "without noise, as one deploys"):
+        assert part in text
+    (data,) = json.loads(cli("table", whole, "--format", "json")[1])["rows"]
+    assert data["mean_actions"]["seeds"] == 2
+    np.testing.assert_allclose(
+        data["mean_actions"]["reward"]["mean"], np.mean([row["episode_reward"] for row in found])
+    )
+    assert data["mean_actions"]["within"] == sum(row["episode_cost"] <= row["cost_limit"] for row in found)
+
+
+def test_a_run_that_trains_on_is_evaluated_anew(copy: pathlib.Path, cli):
+    before = (copy / final.FILE).read_text()
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")
+    assert code == 0 and "evaluating" not in text and (copy / final.FILE).read_text() == before  # it is done
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    assert code == 0 and "evaluating 64 episodes a seed under mean actions" in text
+    assert {row["step"] for row in ends(copy)} == {STEPS + 200}
+    (copy / final.FILE).write_text("")  # of a run of an earlier version
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    assert code == 0 and "evaluating" in text and len(ends(copy)) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_the_evaluation_to_resume(
+    number: int, whole: pathlib.Path, copy: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch
+):
+    """It arrives when all is trained and saved; the evaluation that --resume makes is the same."""
+    (copy / final.FILE).unlink()
+    save = trainer.Trainer._save
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.Trainer, "_save", lambda self: (save(self), signal.raise_signal(number)))
+        code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")
+    assert code == 128 + number and "interrupted" in text and "--resume" in text and not (copy / final.FILE).exists()
+    assert cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")[0] == 0
+    assert ends(copy) == ends(whole)
+    assert_same_run(copy, whole)
+
+
+def test_an_evaluation_that_fails_costs_nothing_else(copy: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch):
+    from pmt_jax.training import failures
+
+    def fail(self, state):
+        raise failures.Failed("out of memory")
+
+    (copy / final.FILE).unlink()
+    compile_run = trainer.compile_run
+
+    def compiled(setup, say):
+        state, programs = compile_run(setup, say)
+        return state, programs._replace(final=lambda state: fail(None, state))
+
+    monkeypatch.setattr(trainer, "compile_run", compiled)
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")
+    assert code == 0 and "note: the evaluation could not be made: out of memory" in text and "done:" in text
+
+
+@pytest.mark.full
+def test_workers_evaluate_as_one_process_does(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+    out = tmp_path / "run"
+    assert cli("train", *ARGUMENTS, "--jobs", 2, "--steps", STEPS, "--out", out)[0] == 0
+    assert ends(out) == ends(whole)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Whether the limit was kept
+
+
+def log_of(costs, multiplier=1.0, deployed=None, limit=1.0, method="mappo_l", **settings) -> run_log.RunLog:
+    """A run of 20 rows: `costs` [S, 20] of the training episodes."""
+    costs = np.asarray(costs, float)
+    names = {"episode_cost": costs, "lambda": np.full_like(costs, multiplier)}
+    evaluation = {} if deployed is None else {"episode_cost": np.asarray(deployed, float)}
+    settings = {"lambda_max": 20.0, **settings}
+    return run_log.RunLog(
+        pathlib.Path("run"), "lane", method, run_log.Limits((limit,)), settings, tuple(range(len(costs))),
+        np.arange(1, 21) * 100, names, evaluation=evaluation,
+    )  # fmt: skip
+
+
+FLAT = np.full(20, 1.3)
+CASES = {
+    "kept": (log_of([FLAT - 0.5], deployed=[0.2]), "kept by 1 of 1 seed", None),
+    "at its bound": (log_of([FLAT, FLAT - 1], multiplier=20.0), "kept by 1 of 2 seeds", "raise --lambda-max"),
+    "still falling": (log_of([np.linspace(5, 1.2, 20)]), "0 of 1 seed in", "costs were still falling"),
+    "never near": (log_of([FLAT + 4]), "0 of 1", "costs never came near the limit (lowest row 5.3); raise --lambda-lr"),
+    "about the limit": (log_of([FLAT]), "0 of 1", "--cost-margin"),
+    "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
+    "trust region": (log_of([FLAT + 4], method="macpo"), "0 of 1", "raise --limit-lr"),
+    "by its noise": (log_of([FLAT], deployed=[0.2]), "; by 1 of 1 seed under mean actions", "keeps the limit"),
+    "only with noise": (log_of([FLAT - 1], deployed=[3.0]), "under mean actions, the worst 2 beyond", "with noise"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_the_end_says_of_a_limit(case: str, monkeypatch: pytest.MonkeyPatch):
+    log, kept, advice = CASES[case]
+    monkeypatch.setattr(verdict, "read", lambda folder, note: log)
+    said = verdict.lines(pathlib.Path("run"))
+    assert 1 <= len(said) <= 3 and kept in said[0]
+    assert (len(said) == 1) if advice is None else any(advice in line for line in said)
+
+
+def test_each_agent_and_a_seed_that_broke_count(monkeypatch: pytest.MonkeyPatch):
+    """The mean over agents hides agent 0, which is beyond by 8."""
+    log = log_of([np.full(20, 9.0), np.full(20, 9.0)], deployed=[9.0, np.nan], limit=10.0)
+    agents = {"episode_cost/agent_0": np.full((2, 20), 18.0), "episode_cost/agent_1": np.zeros((2, 20))}
+    ended = {"episode_cost/agent_0": np.array([18.0, np.nan]), "episode_cost/agent_1": np.array([0.0, np.nan])}
+    log = run_log.dataclasses.replace(
+        log, metrics=log.metrics | agents, evaluation=log.evaluation | ended, broken={1: 2000}
+    )
+    monkeypatch.setattr(verdict, "read", lambda folder, note: log)
+    assert verdict.lines(pathlib.Path("run"))[0].count(", the worst 8 beyond") == 2
+
+
+def test_a_run_says_so_at_its_end(tmp_path: pathlib.Path, cli):
+    """Also one that is run by hand: three lines at most, after the line that says it is done."""
+    out = tmp_path / "run"
+    arguments = ("lane", *ARGUMENTS[1:], "--steps", 400, "--cost-limit", 0.01)
+    code, text, _ = cli("train", *arguments, "--out", out)
+    after = text.splitlines()[[line.startswith("done:") for line in text.splitlines()].index(True) + 1 :]
+    assert code == 0 and 1 <= len(after) <= 3 and after[0].startswith("limit 0.01: kept by ")
+    assert "under mean actions" in after[0] and after == verdict.lines(out)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What can be known of a limit before training
+
+LANE = dict(num_envs=4, rollout_length=25, hidden=(8,), minibatches=1)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "said"),
+    [
+        ("mappo", {"cost_limit": 1.0}, "mappo has no constraint"),
+        ("happo", {"cost_limit": 1.0}, "happo has no constraint"),
+        ("f4sg", {"cost_limit": 0.0}, "no cost is below a limit of 0"),
+        ("macpo", {"cost_limit": 0.0}, "no cost is below a limit of 0"),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 1e-6}, "raise --lambda-lr"),
+        ("mappo_l", {"cost_limit": 1.0, "steps": 400}, "too little to matter"),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_unit": "relative", "lambda_lr": 1e-4}, "raise --lambda-lr"),
+        ("r4sg", {"cost_limit": 1.0, "rollout_length": 5, "steps": 80, "num_envs": 4}, "is hardly ever measured"),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_init": 2.0, "lambda_max": 2.0, "lambda_lr": 1.0}, "may not exceed"),
+        ("mappo", {}, None),
+        ("mappo_l", {"lambda_lr": 1e-6}, None),  # nobody asked for this limit
+        ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 1.0, "steps": 100_000}, None),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_unit": "relative", "lambda_lr": 0.1, "steps": 100_000}, None),
+        ("macpo", {"cost_limit": 1.0}, None),
+    ],
+)
+def test_a_limit_that_the_settings_cannot_reach_is_named_at_the_start(method: str, settings: dict, said: str | None):
+    config = load_config("lane", method=method, **(LANE | {"cost_estimate": "episode"} | settings))
+    notes = outlook.notes(make_setup(config))
+    assert (notes == []) if said is None else any(said in note for note in notes), notes
+
+
+def test_the_rate_that_is_advised_is_enough():
+    """What the sentence says to set, set: nothing is left to say."""
+    config = load_config(
+        "lane", method="mappo_l", cost_limit=1.0, lambda_unit="step", lambda_lr=1e-4, steps=10_000, **LANE
+    )
+    (note,) = outlook.notes(make_setup(config))
+    enough = float(note.rpartition(" to ")[2].split()[0])
+    assert outlook.notes(make_setup(config.replace(lambda_lr=1.1 * enough))) == []
