@@ -148,11 +148,11 @@ _NOT_LAUNCHED = ("parameter", "tuple", "get-tuple-element", "bitcast", "constant
 
 
 def kernels(program: str) -> int:
-    """How many kernels each turn of a compiled program's loop launches: its body's instructions but for bookkeeping."""
-    body = re.search(r"while\(.*body=%?([\w.\-]+)", program)
-    if body is None:
-        return 0
-    found = re.search(rf"^%?{re.escape(body[1])} .*?\{{\n(.*?)^\}}", program, re.MULTILINE | re.DOTALL)
-    lines = found[1].splitlines() if found else []
-    kinds = [match[1] for line in lines if (match := re.search(r"= (?:\(.*?\)|\S+) ([\w\-]+)\(", line))]
-    return sum(kind not in _NOT_LAUNCHED and not kind.endswith("-done") for kind in kinds)
+    """How many kernels a turn of a program's longest loop launches: its body's instructions but for bookkeeping."""
+    found = [0]
+    for body in re.findall(r"while\(.*body=%?([\w.\-]+)", program):
+        text = re.search(rf"^%?{re.escape(body)} .*?\{{\n(.*?)^\}}", program, re.MULTILINE | re.DOTALL)
+        lines = text[1].splitlines() if text else []
+        kinds = [match[1] for line in lines if (match := re.search(r"= (?:\(.*?\)|\S+) ([\w\-]+)\(", line))]
+        found.append(sum(kind not in _NOT_LAUNCHED and not kind.endswith("-done") for kind in kinds))
+    return max(found)

@@ -1,4 +1,4 @@
-"""Networks in training by C++ code, on CPUs with a compiler: what XLA computes, to rounding, in a third of the time.
+"""Networks in training by C++ code, on CPUs with a compiler: what XLA computes, to rounding, in half the time.
 
 XLA's products of small matrices and its many passes over the rows between them cost more than the arithmetic. Here a
 network's forward pass, its backward pass and Adam's step are a call each (mlp.cpp), over the threads of XLA's pool. The
