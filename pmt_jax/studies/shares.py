@@ -127,7 +127,7 @@ def _train(program: sweep.Program, launch: sweep.Launch) -> int:
 
 @contextlib.contextmanager
 def _locked_soon(out: pathlib.Path) -> Iterator[None]:
-    """As `claim`, but waits for others that do the same."""
+    """As `lock.acquire`, but waits for others that do the same."""
     begin = time.monotonic()
     with contextlib.ExitStack() as stack:
         while True:

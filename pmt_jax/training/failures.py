@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import jax
 
 from ..errors import UsageError
+from . import processes
 
 NO_MEMORY = "RESOURCE_EXHAUSTED: "
 LESS = "other programs may share the device: take fewer (--jobs), or a smaller num_envs, rollout_length or seeds"
@@ -26,12 +27,14 @@ def named() -> Iterator[None]:
     """Whatever ends a program inside, its sentence is raised.
 
     Raises:
+      Parted: another process of the run is gone.
       Failed: the program failed; JAX's log of it, a traceback, is not printed.
     """
     log = logging.getLogger("jax._src.callback")
     before, log.disabled = log.disabled, True
     try:
-        yield
+        with processes.reaching_others():
+            yield
     except (jax.errors.JaxRuntimeError, MemoryError) as error:
         raise Failed(explain(error)) from error
     finally:

@@ -12,7 +12,7 @@ import pickle
 import re
 import socket
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -22,7 +22,30 @@ from jax.experimental import multihost_utils
 from ..errors import UsageError
 
 T = TypeVar("T")
+_UNREACHED = re.compile(
+    r"gloo|nccl|coordination service|heartbeat|connection (reset|closed|refused)|^unavailable", re.I
+)
 P = ParamSpec("P")
+
+
+class Parted(UsageError):
+    """Another process of the run has ended, or cannot be reached; the sentence says what was seen of it."""
+
+
+@contextlib.contextmanager
+def reaching_others() -> Iterator[None]:
+    """What JAX raises inside because another process is gone becomes a sentence.
+
+    Raises:
+      Parted: it is gone.
+    """
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:  # JAX's own is a RuntimeError, but where arrays are made it is none
+        if jax.process_count() == 1 or not _UNREACHED.search(str(error)):
+            raise
+        seen = str(error).splitlines()[0]
+        raise Parted(f"another process of the run has ended or cannot be reached ({seen})") from error
 
 
 def join(coordinator: str | None, process: int | None, processes: int | None, devices: int | None = None) -> None:
@@ -119,7 +142,8 @@ def agree(number: int) -> int:
     """The largest of the processes' numbers, below 2**31; all must call it at the same point."""
     if jax.process_count() == 1:
         return number
-    return int(multihost_utils.process_allgather(np.int32(number)).max())
+    with reaching_others():
+        return int(multihost_utils.process_allgather(np.int32(number)).max())
 
 
 def by_first(action: Callable[[], T]) -> T:
@@ -138,7 +162,8 @@ def by_first(action: Callable[[], T]) -> T:
             failure, sent = error, pickle.dumps((2 if isinstance(error, UsageError) else 1, None))
     buffer = np.zeros(agree(len(sent)), np.uint8)
     buffer[: len(sent)] = np.frombuffer(sent, np.uint8)
-    received = multihost_utils.broadcast_one_to_all(buffer)
+    with reaching_others():
+        received = multihost_utils.broadcast_one_to_all(buffer)
     if failure is not None:
         raise failure
     code, result = pickle.loads(np.asarray(received).tobytes())

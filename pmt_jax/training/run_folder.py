@@ -275,7 +275,7 @@ class RunFolder:
         """Writes the evaluation that ends the run.
 
         Raises:
-          Gone: the folder is no longer the one that was claimed.
+          Gone: the folder is no longer the one that was locked.
         """
         self.check()
         self._write_evaluation(rows)

@@ -32,6 +32,7 @@ from ..output import Say, say, silent
 from . import chunks, failures, final, health, lock, outlook, processes
 from .checkpoint import unpack
 from .compile import Programs, check_memory, compile_run, use_cache
+from .history import checkpoint_steps
 from .loggers import Profile, check_loggers
 from .metrics import Row, evaluation_columns, judged_cost, make_rows, seed_intervals, without_metrics
 from .progress import Progress, alive, duration
@@ -143,6 +144,10 @@ def _run(
         begin()
         trainer.train(interrupts)
         stack.close()
+    except processes.Parted as parted:
+        say(trainer.parted(parted))  # every process: the first may be the one that is gone
+        lock.release_all()
+        os._exit(1)  # JAX's own end waits for the others
     except lock.Gone as gone:
         trainer.say(trainer.rescue(gone))
         return 1
@@ -503,6 +508,12 @@ class Trainer:
                 f"stopped: {gone}; what was trained is lost, as no folder next to it can be written: {error.strerror}"
             )
         return f"stopped: {gone}; saved as of step {self.step:,} in {saved}. Continue with: {self._continuing(saved)}"
+
+    def parted(self, parted: processes.Parted) -> str:
+        """What happened to a run of several processes, one of which is gone, and how to continue."""
+        steps = checkpoint_steps(self.folder.path)
+        saved = f"saved as of step {steps[0]:,}" if steps else "nothing was saved here yet"
+        return f"stopped: {parted}; {saved}. Continue with: {self.command}"
 
     def write_failure(self, error: OSError) -> str:
         """What to do about a full disk, a quota, or a share that is gone."""

@@ -8,7 +8,7 @@ import shlex
 import jax
 import pytest
 
-from pmt_jax.training import failures, trainer
+from pmt_jax.training import failures, processes, trainer
 from runs import ARGUMENTS, STEPS, TINY, assert_same_run, rows
 
 CALLBACK = """
@@ -131,3 +131,32 @@ def test_an_evaluation_that_fails_is_one_sentence(whole: pathlib.Path, cli, monk
     monkeypatch.setattr(evaluate.jax, "jit", fail)
     code, _, err = cli("eval", whole, "--episodes", 2)
     assert (code, err) == (2, "pmt: the device failed: INTERNAL: the device is lost\n")
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "UNKNOWN: Gloo all-reduce failed: [gloo/transport/tcp/pair.cc:538] Read error [127.0.0.1]:45252: reset by peer",
+        "INTERNAL: NCCL operation ncclGroupEnd() failed: remote process exited",
+        "UNAVAILABLE: Task /job:jax_worker/replica:0/task:1 heartbeat timeout",
+    ],
+)
+@pytest.mark.parametrize("kind", [ValueError, jax.errors.JaxRuntimeError])
+def test_a_process_that_is_gone_is_a_sentence_and_no_traceback(said: str, kind: type, monkeypatch: pytest.MonkeyPatch):
+    """As seen with SLURM when a node was killed; a single process, or another mistake, keeps its own error."""
+
+    def fail():
+        raise kind(f"{said}\nand much more")
+
+    monkeypatch.setattr(processes.jax, "process_count", lambda: 2)
+    with pytest.raises(processes.Parted, match="another process of the run has ended or cannot be reached") as found:
+        with failures.named():
+            fail()
+    assert "and much more" not in str(found.value)
+    with pytest.raises(ValueError, match="shapes"):
+        with processes.reaching_others():
+            raise ValueError("shapes differ")
+    monkeypatch.setattr(processes.jax, "process_count", lambda: 1)
+    with pytest.raises(kind):
+        with processes.reaching_others():
+            fail()

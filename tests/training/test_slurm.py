@@ -29,6 +29,7 @@ pytestmark = [
 ]
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "howto" / "hosts.md"
 NODES = ("127.0.0.2", "127.0.0.3", "127.0.0.4")  # addresses for names, so that the processes find the first of them
+DEVICES = ("null", "zero", "full", "random")  # four files in the place of GPUs, so that jobs may ask for some
 TINY = "lane --num-envs 4 --rollout-length 25 --hidden 8 --minibatches 1 --epochs 1 --no-cache"
 PATIENCE = 300.0  # seconds for whatever should happen
 
@@ -38,7 +39,7 @@ SlurmctldHost={host}(127.0.0.1)
 SlurmctldPort={port}
 SlurmUser=root
 AuthType=auth/munge
-AuthInfo=socket={top}/munge/socket
+AuthInfo=socket={top}/munge/socket,cred_expire=5
 StateSaveLocation={top}/state
 SlurmdSpoolDir={top}/spool/%n
 SlurmctldPidFile={top}/slurmctld.pid
@@ -83,7 +84,7 @@ class Cluster:
         numbers = {"port": port, "first": port + 1, "last": port + 3}
         text = CONFIGURATION.format(host=socket.gethostname().split(".")[0], top=top, **numbers)
         (top / "slurm.conf").write_text(text)
-        (top / "gres.conf").write_text("Name=gpu Count=4\n")
+        (top / "gres.conf").write_text("".join(f"Name=gpu File=/dev/{name}\n" for name in DEVICES))
         self.env = environment() | {"SLURM_CONF": str(top / "slurm.conf")}
         self.env["PATH"] = f"{pathlib.Path(sys.executable).parent}:{self.env['PATH']}"  # where pmt is
 
@@ -149,9 +150,11 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         free.bind(("127.0.0.1", 0))
         port = 20_000 + free.getsockname()[1] % 9_000
     made = Cluster(tmp_path_factory.mktemp("slurm"), port)
-    made.start()
-    yield made
-    made.stop()
+    try:
+        made.start()
+        yield made
+    finally:
+        made.stop()
 
 
 def page_script(run: pathlib.Path, training: str) -> str:
@@ -205,6 +208,8 @@ def test_the_pages_script_saves_requeues_and_survives_a_node(cluster: Cluster):
         process.kill()
     until("a sentence", lambda: "NODE FAILURE" in (cluster.top / "out.txt").read_text().upper())
     lost = last()
+    assert "stopped: another process of the run has ended or cannot be reached" in (cluster.top / "out.txt").read_text()
+    assert "Traceback" not in (cluster.top / "out.txt").read_text()
     until("another start", lambda: (cluster.top / "out.txt").read_text().count("resuming after") == 2)
     until("rows beyond what was lost", lambda: last() > lost)
     cluster.call("scancel", "--signal=TERM", job)
