@@ -54,12 +54,12 @@ def cache_of_the_user(request: pytest.FixtureRequest):
     Its key has all that it is made of, so nothing stale is found. With less optimisation it compiles in half the time;
     processes that tests start, and `-m full`, have all of it.
     """
-    from envs.physics.fused import cpu
+    from envs import native
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(CACHE.parent))
         if "not full" in request.config.getoption("markexpr"):
-            patch.setattr(cpu, "_FLAGS", ["-O1" if flag == "-O3" else flag for flag in cpu._FLAGS])
+            patch.setattr(native, "_FLAGS", ["-O1" if flag == "-O3" else flag for flag in native._FLAGS])
         yield
 
 
