@@ -18,6 +18,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench import records
+from pmt_jax.policies import hub
 from pmt_jax.policies.evaluate import evaluate_run
 from pmt_jax.studies.plot import METHOD_COLOURS
 from pmt_jax.training.compile import use_cache
@@ -69,7 +70,11 @@ def main() -> None:
     parser.add_argument("--measure", action="store_true", help="evaluate the pretrained policies first")
     if parser.parse_args().measure:
         use_cache()
-        found = {task: {method: measure(task, method) for method in METHOD_COLOURS} for task in WINDOWS}
+        there = set(hub.names())
+        found = {
+            task: {method: measure(task, method) for method in METHOD_COLOURS if f"hub:{task}/{method}" in there}
+            for task in WINDOWS
+        }
         STORED.write_text(json.dumps(found) + "\n")
     draw(json.loads(STORED.read_text()), PICTURE)
     print(f"docs/{PICTURE.name}")

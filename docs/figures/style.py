@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 from bench.tables import study
 from pmt_jax.studies.plot import INK, METHOD_COLOURS
 
-NAMES = {"mappo": "MAPPO", "happo": "HAPPO", **study.NAMES}
+NAMES = {method: method.upper().replace("_L", "-L").replace("_", " ") for method in METHOD_COLOURS} | study.NAMES
 NAMES |= {f"{method} pid": f"{name} PID" for method, name in NAMES.items()} | {"mappo_l pid": "PID"}
 DANGER = "#f6d5c3"  # a pale vermilion, where a step costs
 WALL = "#404040"

@@ -5,7 +5,7 @@ Adding one is adding a row:
 
   >>> METHODS["my_happo"] = Method(order="sequential", constraint="none")
 
-A row may also stand in a Python file of your own: `--method my_methods.py:dread`.
+A Python file of your own may hold a row, too: `--method my_methods.py:dread`.
 """
 
 from __future__ import annotations
