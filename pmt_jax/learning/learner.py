@@ -131,8 +131,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     value, next_value = critics.values(state.critic, setup.nets.value, seen)
     cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
-    reward = batch.reward[..., None] if setup.own_critics else batch.reward
-    advantage, returns = gae(reward, value, next_value, *ends)
+    advantage, returns = gae(batch.reward[..., None] if setup.own_critics else batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.

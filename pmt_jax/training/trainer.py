@@ -69,12 +69,10 @@ def train(
     Args:
       out: the run folder; a new one, runs/TASK-METHOD-TIME, if None. It must not hold another run unless `resume`.
       resume: continue the run in `out` from its last checkpoint, bit for bit.
-      cache: keep compiled programs on disk for the next start.
-      loggers: where the rows are written besides metrics.jsonl: csv, tensorboard, wandb.
+      cache: keep compiled programs on disk; loggers: where rows also go to: csv, tensorboard, wandb.
       profile: a folder for a JAX profiler trace of a few chunks.
       trials: settings and seeds of `config.seeds` trials, in place of the config's.
       devices: how many to split the run over, of all processes together: one if None, or all of several processes'.
-        Of these, the first writes and prints, and all return the same.
       workers: processes that share the seeds and the CPUs (see workers.py).
       warm_start: what makes the first state begin where another run ended (`policies.warm_start.prepare`).
       change: the settings may differ from those of the run to resume; changes.jsonl in its folder keeps how.
@@ -85,6 +83,7 @@ def train(
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
       trial) broke, `debug` found something, a program failed, or the folder is gone or could not be written any more.
+      All processes return the same; the first one writes and prints.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
@@ -98,8 +97,7 @@ def train(
         profile.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts(say, lock.release_all))
-        with tasks.announcing(say):
-            setup = dataclasses.replace(_make_setup(config, trials, devices, debug), workers=workers)
+        setup = dataclasses.replace(_make_setup(config, trials, devices, debug, say), workers=workers)
         folder = stack.enter_context(contextlib.closing(RunFolder(setup, say, rescue)))
         folder.acquire(out, resume, change)
         begin = None if folder.saved else warm_start(setup)
@@ -118,7 +116,7 @@ def _compile(setup: Setup, cache: bool, say: Say) -> tuple[LearnerState, Program
         return (start_workers if setup.workers > 1 else compile_run)(setup, say)
 
 
-def _make_setup(config: Config, trials: Trials | None, devices: int | None, debug: bool) -> Setup:
+def _make_setup(config: Config, trials: Trials | None, devices: int | None, debug: bool, say: Say) -> Setup:
     """The run's setup.
 
     Raises:
@@ -127,7 +125,8 @@ def _make_setup(config: Config, trials: Trials | None, devices: int | None, debu
     mesh = sharding.make_mesh(config, devices)
     if debug and mesh:
         raise UsageError("--debug runs on one device in one process; leave out --devices")
-    setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
+    with tasks.announcing(say):
+        setup = dataclasses.replace(make_setup(config), trials=trials, mesh=mesh, debug=debug)
     check_memory(setup)
     return setup
 

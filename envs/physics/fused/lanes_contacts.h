@@ -130,8 +130,11 @@ FUNCTION void pair_contacts(Worlds& w) {
     Nearest nearest = {none, none, mask_of(false), none, none};
     if (SEGMENTS[one].capsule) nearest = nearest_of_capsules(s);
     else if (SEGMENTS[two].capsule) nearest = nearest_of_sphere_and_capsule(s);
-    pair_contact(w, c, s, nearest.first, nearest.second, mask_of(true));
-    if (any(nearest.two)) pair_contact(w, c, s, nearest.first_again, nearest.second_again, nearest.two);
+    for (int k = 0; k < 2; ++k) {  // one call: what is inlined once compiles sooner
+      const Mask wanted = k ? nearest.two : mask_of(true);
+      const Num first = k ? nearest.first_again : nearest.first, second = k ? nearest.second_again : nearest.second;
+      if (any(wanted)) pair_contact(w, c, s, first, second, wanted);
+    }
   }
 }
 
@@ -174,12 +177,16 @@ FUNCTION void block_pair(Worlds& w, int c, const BlockRow& block, const BlockFra
   const Num middle[3] = {inside.x, inside.y, inside.z};
   const Mask near = square_outside(middle, block.size) <= Num(PAIRS[c].reach * PAIRS[c].reach * Real(1.0001));
   if (!any(near)) return;
-  if (!segment.capsule) return block_contact(w, c, block, in, place, near);
   const Vec3 axis = turned_with_body(w, segment.body, segment.half), inside_axis = in.axes * axis;
-  const Num half[3] = {inside_axis.x, inside_axis.y, inside_axis.z};
-  const Spheres spheres = spheres_on_box(middle, half, block.size);
-  block_contact(w, c, block, in, place + axis * spheres.first, near);
-  if (any(near & spheres.two)) block_contact(w, c, block, in, place + axis * spheres.second, near & spheres.two);
+  Spheres spheres = {Num(0), Num(0), mask_of(false)};
+  if (segment.capsule) {
+    const Num half[3] = {inside_axis.x, inside_axis.y, inside_axis.z};
+    spheres = spheres_on_box(middle, half, block.size);
+  }
+  for (int k = 0; k < 2; ++k) {  // one call: what is inlined once compiles sooner
+    const Mask wanted = k ? near & spheres.two : near;
+    if (any(wanted)) block_contact(w, c, block, in, place + axis * (k ? spheres.second : spheres.first), wanted);
+  }
 }
 
 FUNCTION void block_contacts(Worlds& w) {
