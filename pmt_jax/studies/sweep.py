@@ -171,6 +171,11 @@ def train_programs(programs: Sequence[Program], launch: Launch = ONE_AT_A_TIME) 
 
 
 def write_points(program: Program) -> None:
+    """Writes the settings of each of the points into the folder of its program.
+
+    Raises:
+      UsageError: the folder cannot be written to.
+    """
     try:
         (program.folder / "points").mkdir(parents=True, exist_ok=True)
         for name, config in program.points.items():

@@ -174,7 +174,7 @@ def test_auto_reset_starts_anew_every_time(name: str):
     vector = VectorEnv(made(name), 2, horizon=2)
     step = jax.jit(vector.step)
     state = jax.jit(vector.reset)(jax.random.key(0))
-    starts = [np.asarray(raw_data(state.env.carry) and state.env.global_state)]
+    starts = [np.asarray(state.env.global_state)]
     keys = [state.episode]
     for t in range(4):
         state, outcome = step(state, actions(name)[:2])
