@@ -108,7 +108,7 @@ def make_engine(
     if chosen == "warp":
         from .warp_engine import WarpEngine
 
-        return WarpEngine(model, substeps, readout, contacts, forward)
+        return WarpEngine(model, substeps, readout, contacts)
     from .mjx_engine import MjxEngine
 
     return MjxEngine(model, substeps, readout, forward)

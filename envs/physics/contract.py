@@ -123,8 +123,8 @@ def obstacle(
 ) -> str | None:
     """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can.
 
-    Only `fused` depends on the model, its readouts and the forward pass. Without a model, the answer is about the
-    machine alone.
+    `fused` depends on the model, its readouts and the forward pass, `warp` on the forward pass. Without a model, the
+    answer is about the machine alone.
     """
     device = jax.devices()[0]
     if physics == "fused":
@@ -136,6 +136,8 @@ def obstacle(
             return f"needs an NVIDIA GPU; found {device.device_kind} (take 'mujoco' on CPUs, 'mjx' elsewhere)"
         if installed_version("warp-lang") is None:
             return "needs warp-lang; found none; install it with pip install 'pmt-jax[warp]'"
+        if forward:
+            return "cannot step this model: its step has no forward pass after the substeps (take 'mjx')"
     return None
 
 
@@ -149,7 +151,7 @@ def _fused_obstacle(
     if forward and not reason:
         reason = "cannot step this model: its step has no forward pass after the substeps"
     if reason:
-        return f"{reason} (take '{'mujoco' if on_cpu else 'warp'}')"
+        return f"{reason} (take '{'mujoco' if on_cpu else 'mjx' if forward else 'warp'}')"
     if on_cpu:
         return native.obstacle("fused")
     from .fused import nvrtc

@@ -31,20 +31,13 @@ class WarpEngine(Remade):
 
     name = "warp"
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        substeps: int,
-        readout: Readout,
-        contacts: int | None = None,
-        forward: bool = False,
-    ):
+    def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None):
         import_mjx()  # it brings MuJoCo-Warp, and prints where Warp is missing
         _quieten()
         from . import warp_contacts
 
         warp_contacts.install()
-        self._c_model, self._substeps, self._readout, self._forward = model, substeps, dict(readout), forward
+        self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
         self._contacts, self._rows = _room(model, contacts)
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
         self._call: Any = None
@@ -120,12 +113,9 @@ class WarpEngine(Remade):
             for substep in range(self._substeps):
                 # Forces after the constraints are read at the end of a control step only; Warp works them out in each
                 # of the integrator's stages, so the substeps before the last go without.
-                last = substep == self._substeps - 1 and not self._forward
+                last = substep == self._substeps - 1
                 model.opt.run_rne_postconstraint = last and needs_post_constraint(self._readout)
                 mujoco_warp.step(model, data)
-            if self._forward:
-                model.opt.run_rne_postconstraint = needs_post_constraint(self._readout)
-                mujoco_warp.forward(model, data)
             for name, array in zip(self._fields(), outputs, strict=True):
                 warp.copy(array, getattr(data, name))
 
