@@ -46,7 +46,6 @@ def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
         pytest.param("mappo_pid", 2.5, 16.3, marks=pytest.mark.full),  # cost 1.48 +- 0.18, reward 16.66 +- 0.10
         pytest.param("crpo", 1.5, 15.5, marks=pytest.mark.full),  # cost 1.25 +- 0.07, reward 15.87 +- 0.09
         pytest.param("p3o", 1.1, 14.5, marks=pytest.mark.full),  # cost 0.81 +- 0.08, reward 15.35 +- 0.25
-        pytest.param("focops", 3, 16.3, marks=pytest.mark.full),  # cost 1.70 +- 0.27, reward 16.75 +- 0.11
     ],
 )
 def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float, least_reward: float):
