@@ -48,18 +48,13 @@ def state_of_the_user(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(autouse=True, scope="session")
-def cache_of_the_user(request: pytest.FixtureRequest):
+def cache_of_the_user():
     """What is compiled for `fused` is kept where JAX's programs are: for all processes of the tests, and the next time.
 
-    Its key has all that it is made of, so nothing stale is found. With less optimisation it compiles in half the time;
-    processes that tests start, and `-m full`, have all of it.
+    Its key has all that it is made of, so nothing stale is found.
     """
-    from envs import native
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(CACHE.parent))
-        if "not full" in request.config.getoption("markexpr"):
-            patch.setattr(native, "_FLAGS", ["-O1" if flag == "-O3" else flag for flag in native._FLAGS])
         yield
 
 

@@ -56,7 +56,7 @@ train list.toml | unknown task '['lane']'
 train date.toml | seed = datetime.date(2026, 1, 1) does not fit: expected a whole number
 train nested.toml | clip = {'x': 1} does not fit: expected a number
 train twice.toml | twice.toml is not valid TOML: Cannot overwrite a value
-train method.toml | unknown method 'ppo'; did you mean 'mappo'?
+train method.toml | unknown method 'ppo'; did you mean 'ippo'?
 train pairs.toml | env = [1] does not fit: expected name=value
 train missing.py:Env | there is no environment file
 train empty.py | should hold one class with reset and step

@@ -82,7 +82,7 @@ def test_names_are_no_code_in_a_replay(tmp_path: pathlib.Path, monkeypatch: pyte
 def test_names_are_no_code_in_a_report(tmp_path: pathlib.Path):
     """The task, the method, the folder, settings, versions, and a name that looks like mathematics to matplotlib."""
     named = {"task": f"$\\x {SCRIPT}", "method": "<i>", "episode_cost": 1.0, "violation_rate": 0.0}
-    config = f'task = "{SCRIPT}.py"\n[env]\nname = "{SCRIPT}"\n'
+    config = f'task = "{SCRIPT}.py"\n[env]\ntitle = "{SCRIPT}"\n'
     folder = written(tmp_path / "<img src=x>", [row(10, 0, 1.0, **named)], config)
     (folder / "versions.json").write_text(json.dumps({SCRIPT: SCRIPT}))
     report.report([folder], tmp_path / "x.html", say=lambda _: None)

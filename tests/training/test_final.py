@@ -59,9 +59,9 @@ def test_a_signal_leaves_the_evaluation_to_resume(
 ):
     """It arrives when all is trained and saved; the evaluation that --resume makes is the same."""
     (copy / final.FILE).unlink()
-    save = trainer.Trainer._save
+    save = trainer.Trainer.save
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.Trainer, "_save", lambda self: (save(self), signal.raise_signal(number)))
+        patch.setattr(trainer.Trainer, "save", lambda self: (save(self), signal.raise_signal(number)))
         code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")
     assert code == 128 + number and "interrupted" in text and "--resume" in text and not (copy / final.FILE).exists()
     assert cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")[0] == 0

@@ -470,7 +470,7 @@ def test_compilers_are_asked_in_the_order_of_the_readme(fresh, monkeypatch):
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, HANGING], ids=["fails", "writes garbage", "hangs"])
 def test_compilers_that_do_not_work_end_in_mujoco_and_a_sentence(fresh, text, monkeypatch):
-    monkeypatch.setattr(cpu, "_PATIENCE", 60.0 if text != HANGING else 0.2)
+    monkeypatch.setattr(native, "_PATIENCE", 60.0 if text != HANGING else 0.2)
     script(fresh, "c++", text)
     env = envs.make("ant_2x4")
     assert env.engine == "mujoco"
