@@ -25,6 +25,7 @@ T = TypeVar("T")
 _UNREACHED = re.compile(
     r"gloo|nccl|coordination service|heartbeat|connection (reset|closed|refused)|^unavailable", re.I
 )
+TRY_AGAIN = 75  # exit code, EX_TEMPFAIL of sysexits.h: the same command with --resume continues
 P = ParamSpec("P")
 
 

@@ -83,6 +83,7 @@ def train(
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
       trial) broke, `debug` found something, a program failed, or the folder is gone or could not be written any more.
+      The process ends with `processes.TRY_AGAIN` if another one of the run is gone.
       All processes return the same; the first one writes and prints.
 
     Raises:
@@ -146,7 +147,7 @@ def _run(
     except processes.Parted as parted:
         say(trainer.parted(parted))  # every process: the first may be the one that is gone
         lock.release_all()
-        os._exit(1)  # JAX's own end waits for the others
+        os._exit(processes.TRY_AGAIN)  # JAX's own end waits for the others
     except lock.Gone as gone:
         trainer.say(trainer.rescue(gone))
         return 1

@@ -34,7 +34,7 @@ ELSEWHERE = {
     r"git clone|cd|python -m venv|source|pip install": "downloads; .ci/run makes environments and installs into them",
     r"pytest": "the first part of .ci/run",
     r"pre-commit": "writes into .git; tests/docs/test_docs.py compares its hooks with .ci/run",
-    r"srun|.*--coordinator": "several hosts; tests/training/test_devices.py has several processes",
+    r"srun|case|.*--coordinator": "several hosts; tests/training/test_devices.py has several processes",
     r"nvidia-": "an NVIDIA GPU",
     r".*--loggers wandb": "wandb, which .[dev] does not have; tests/training/test_loggers.py runs it if it is there",
     r"python -m bench peers": "other programs, which a reader downloads; tests/bench has doubles of them",
