@@ -175,7 +175,8 @@ def test_a_process_without_locks_starts_and_evaluates():
         "sys.exit(main(['train', 'lane']))"
     )
     done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True)
-    assert done.returncode == 2 and "fcntl" in done.stderr and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and "fcntl" in done.stderr.splitlines()[-1]  # JAX may have warned of its cache before
+    assert "Traceback" not in done.stderr
 
 
 # ---------------------------------------------------------------------------------------------------------------------
