@@ -268,6 +268,7 @@ def test_the_clip_of_cost_values_is_that_of_the_cost_critic_alone():
 # What it keeps
 
 
+@pytest.mark.full
 def test_every_network_keeps_what_it_learned():
     made = program("mixed")
     start, (state, _) = made.init(made.setup.hyper, jax.random.key(0)), trained("mixed")

@@ -176,6 +176,7 @@ def test_the_policy_that_is_published_keeps_every_agent_within(file: pathlib.Pat
     assert which == "best" and found["episode_cost_worst"][0] == 0
 
 
+@pytest.mark.full
 def test_episodes_of_an_evaluation_are_within_if_every_agent_and_cost_is(file: pathlib.Path):
     """Of 64 episodes with random costs of three agents and two costs, as a plain loop over every step says."""
     config = load_config(f"{file}:Drawn", method="macpo", num_envs=4, hidden=[8])

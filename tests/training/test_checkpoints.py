@@ -174,6 +174,7 @@ def test_a_change_before_the_next_checkpoint_is_no_edit(copy: pathlib.Path, cli,
     assert cli("eval", copy, "--episodes", 1)[0] == 0
 
 
+@pytest.mark.full
 def test_a_checkpoint_of_another_run_or_step(whole: pathlib.Path, copy: pathlib.Path, tmp_path: pathlib.Path, cli):
     other = tmp_path / "other"
     assert cli("train", *ARGUMENTS, "--seed", 7, "--steps", 2000, "--out", other)[0] == 0

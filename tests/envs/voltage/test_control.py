@@ -120,6 +120,7 @@ def test_reset_is_within_the_data_and_differs_by_key() -> None:
     assert not states.terminated.any() and not states.cost.any() and not states.reward.any()
 
 
+@pytest.mark.full
 def test_a_date_without_solution_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     keys = jax.random.split(jax.random.key(0), 16)
     env = folder_env()
