@@ -29,7 +29,6 @@ pytestmark = [
 ]
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "howto" / "hosts.md"
 NODES = ("127.0.0.2", "127.0.0.3", "127.0.0.4")  # addresses for names, so that the processes find the first of them
-DEVICES = ("null", "zero", "full", "random")  # four files in the place of GPUs, so that jobs may ask for some
 TINY = "lane --num-envs 4 --rollout-length 25 --hidden 8 --minibatches 1 --epochs 1 --no-cache"
 PATIENCE = 300.0  # seconds for whatever should happen
 
@@ -56,8 +55,7 @@ SlurmdParameters=config_overrides
 ReturnToService=2
 SlurmdTimeout=10
 KillWait=10
-GresTypes=gpu
-NodeName=127.0.0.[2-4] NodeHostname={host} NodeAddr=127.0.0.1 Port=[{first}-{last}] CPUs=64 Gres=gpu:4 State=UNKNOWN
+NodeName=127.0.0.[2-4] NodeHostname={host} NodeAddr=127.0.0.1 Port=[{first}-{last}] CPUs=64 State=UNKNOWN
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
@@ -84,7 +82,6 @@ class Cluster:
         numbers = {"port": port, "first": port + 1, "last": port + 3}
         text = CONFIGURATION.format(host=socket.gethostname().split(".")[0], top=top, **numbers)
         (top / "slurm.conf").write_text(text)
-        (top / "gres.conf").write_text("".join(f"Name=gpu File=/dev/{name}\n" for name in DEVICES))
         self.env = environment() | {"SLURM_CONF": str(top / "slurm.conf")}
         self.env["PATH"] = f"{pathlib.Path(sys.executable).parent}:{self.env['PATH']}"  # where pmt is
 
@@ -163,7 +160,7 @@ def page_script(run: pathlib.Path, training: str) -> str:
     changes = {
         "RUN=runs/ant": f"RUN={run}",
         "ant_2x4 --method f4sg --seeds 8 --steps 1e7": training,
-        "--ntasks-per-node=4": "--ntasks-per-node=1",
+        "--ntasks-per-node=4 --gpus-per-node=4": "--ntasks-per-node=1",
     }
     for old, new in changes.items():
         assert old in script
