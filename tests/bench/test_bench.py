@@ -652,5 +652,5 @@ ENTRY %main (a: f32[4]) -> f32[4] {
 def test_a_gradient_step_is_timed_by_part():
     for case in BENCHES["update"].quick:
         row = update.update(case)
-        assert row["minibatch"] == 16 and row["step_seconds"] > 0
+        assert row["minibatch"] > 0 and row["step_seconds"] > 0
         assert {"gather_seconds", "forward_seconds", "backward_seconds", "adam_seconds"} <= row.keys()

@@ -59,6 +59,7 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"--method r4sg", "--method f4sg"),
     (r"train ant_2x4(.*) --eval-interval", r"train lane\1 --eval-interval"),
     (r"method=mappo_l,f4sg,r4sg", "method=f4sg"),
+    (r"sweep study\.toml (.*--part)", r"sweep lane --set clip=0.1,0.2 --method mappo \1"),
     (r"\[64,64\],\[128,128\]", "[32,32]"),
     (r"bench run.*", 'bench run ant --quick --only "plain loop"'),
     (r"HEAD~5", "bench/results"),  # a checkout may be shallow

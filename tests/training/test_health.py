@@ -140,10 +140,10 @@ import dataclasses
 import jax.numpy as jnp
 from envs.toys import Lane
 
-class Broken(Lane):  # finite for actions of 0 and 1, with which a task is checked before training
+class Broken(Lane):  # finite for actions of -1, 0 and 1, with which a task is checked before training
     def step(self, state, action):
         after = super().step(state, action)
-        reward = jnp.where((action * (1 - action)).any(), jnp.nan, after.reward)
+        reward = jnp.where((action * (1 - action**2)).any(), jnp.nan, after.reward)
         return dataclasses.replace(after, reward=reward)
 """
 
