@@ -15,7 +15,7 @@ import optax
 
 from pmt_jax import load_config, make_setup
 from pmt_jax.learning import critics, fused, policies, schedules
-from pmt_jax.learning.optimise import Loss, fit, init_train_state
+from pmt_jax.learning.optimise import Loss, descend, fit, init_train_state
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import Params, PolicySamples
 
@@ -93,8 +93,7 @@ def _loops(setup: Setup, network: str) -> dict[str, Any]:
             return net, _first(gradient)
         if last == "norm":
             return net, optax.tree.norm(gradient)
-        params, opt_state, norm = _adam(net.params, net.opt_state, gradient, **limits)
-        return type(net)(params, opt_state), norm
+        return descend(net, gradient, **limits)
 
     def loop(last: str) -> Any:
         return jax.lax.scan(functools.partial(step, last), start, order.reshape(config.epochs * config.minibatches, -1))
@@ -109,15 +108,6 @@ def _loops(setup: Setup, network: str) -> dict[str, Any]:
 def _first(tree: Any) -> jax.Array:
     """A number that depends on the whole of every leaf, because of the barrier before it."""
     return sum(x.ravel()[0] for x in jax.tree.leaves(tree))  # pyright: ignore[reportReturnType] (never empty)
-
-
-def _adam(params: Params, opt_state: Any, gradient: Params, learning_rate: float, max_grad_norm: float) -> Any:
-    if fused.available():
-        return fused.adam(params, opt_state, gradient, learning_rate, max_grad_norm)
-    norm = optax.tree.norm(gradient)
-    scaled = jax.tree.map(lambda g: g * jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12)), gradient)
-    direction, opt_state = optax.scale_by_adam(eps=1e-5).update(scaled, opt_state)
-    return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), opt_state, norm
 
 
 def _draw(*shapes: tuple[int, ...]) -> list[jax.Array]:

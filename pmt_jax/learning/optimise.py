@@ -35,6 +35,20 @@ def shuffled(key: jax.Array, count: int) -> jax.Array:
     return jnp.sort(words | jnp.arange(count, dtype=jnp.uint32)) & (2**bits - 1)
 
 
+def descend(
+    net: TrainState, gradient: Params, learning_rate: jax.Array | float, max_grad_norm: jax.Array | float
+) -> tuple[TrainState, jax.Array]:
+    """A step of Adam along `gradient`, scaled down to the norm `max_grad_norm`; also the norm that it had."""
+    if fused.available() and fused.takes(net.params):
+        params, opt_state, norm = fused.adam(net.params, net.opt_state, gradient, learning_rate, max_grad_norm)
+        return TrainState(params, opt_state), norm
+    norm = optax.tree.norm(gradient)
+    shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
+    direction, opt_state = _ADAM.update(jax.tree.map(lambda g: g * shrink, gradient), net.opt_state)
+    params = jax.tree.map(lambda p, d: p - learning_rate * d, net.params, direction)
+    return TrainState(params, opt_state), norm
+
+
 def fit(
     net: TrainState,
     loss: Loss,
@@ -57,7 +71,6 @@ def fit(
     Returns:
       The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
-    kernel = fused.available() and fused.takes(net.params)
     count = jax.tree.leaves(rows)[0].shape[0]
     shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
@@ -65,14 +78,8 @@ def fit(
         # Said in the scan: what is said before it does not reach all rows, and devices then exchange some at each step.
         minibatch = sharding.shard(jax.tree.map(lambda x: x[index], sharding.replicate(rows)))
         (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(net.params, minibatch)
-        if kernel:
-            params, opt_state, norm = fused.adam(net.params, net.opt_state, gradient, learning_rate, max_grad_norm)
-            return TrainState(params, opt_state), {"loss": value, "grad_norm": norm, **metrics}
-        norm = optax.tree.norm(gradient)
-        shrink = jnp.minimum(1.0, max_grad_norm / jnp.maximum(norm, 1e-12))
-        direction, opt_state = _ADAM.update(jax.tree.map(lambda g: g * shrink, gradient), net.opt_state)
-        params = jax.tree.map(lambda p, d: p - learning_rate * d, net.params, direction)
-        return TrainState(params, opt_state), {"loss": value, "grad_norm": norm, **metrics}
+        net, norm = descend(net, gradient, learning_rate, max_grad_norm)
+        return net, {"loss": value, "grad_norm": norm, **metrics}
 
     net, metrics = jax.lax.scan(step, net, shuffle.reshape(epochs * minibatches, -1))
     return net, jax.tree.map(lambda x: x[-minibatches:].mean(0), metrics)
