@@ -154,7 +154,7 @@ def update_policy(
     violation: jax.Array,
     key: jax.Array,
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """One policy's step on its samples [R, ...].
+    """One policy's step on its samples [R, ...]: of a trust region, or epochs of policy gradient (PPO).
 
     Args:
       violation: [K] cost per step, how far the costs are beyond what the policy is to keep, a lowered limit.
@@ -164,20 +164,6 @@ def update_policy(
     """
     if setup.method.constraint == "trust_region":
         return trust_region_steps(setup, hyper, now, net, samples, violation, key)
-    net, metrics = _epochs(setup, hyper, now, net, samples, violation, key)
-    return net, jnp.zeros(()), metrics
-
-
-def _epochs(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    net: TrainState,
-    samples: PolicySamples,
-    violation: jax.Array,
-    key: jax.Array,
-) -> tuple[TrainState, Metrics]:
-    """Epochs of policy gradient (PPO)."""
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
     loss = policy_loss(setup, hyper, now, samples, violation)
@@ -186,7 +172,7 @@ def _epochs(
     # Nothing clips FOCOPS's ratios. The paper ends an update beyond this bound; here the step is shortened to it.
     kl_max = jnp.minimum(now.kl_max, now.kl_limit) if first_order else now.kl_max
     params, metrics["share_of_step"] = _limit_kl(setup, kl_max, net.params, new.params, samples)
-    return TrainState(params, new.opt_state), metrics
+    return TrainState(params, new.opt_state), jnp.zeros(()), metrics
 
 
 def policy_loss(
