@@ -83,8 +83,7 @@ def train(
     Returns:
       The exit code: 0 when finished, 128 + the signal's number when interrupted (all saved), 1 when a seed (but not a
       trial) broke, `debug` found something, a program failed, or the folder is gone or could not be written any more.
-      The process ends with `processes.TRY_AGAIN` if another one of the run is gone.
-      All processes return the same; the first one writes and prints.
+      All processes return the same, and end with `processes.TRY_AGAIN` if one is gone; the first writes and prints.
 
     Raises:
       UsageError: a setting or the folder cannot be used; nothing has been written then.
@@ -367,9 +366,8 @@ class Trainer:
             rows = self._end_row()
         if self.broken:
             broken = np.array([i in self.broken for i in range(self.config.seeds)])
-            state = self.programs.where_seed(
-                broken, state, self._row_start
-            )  # which stays whole: `train` may go back to it
+            # The row's start stays whole: `train` may go back to it.
+            state = self.programs.where_seed(broken, state, self._row_start)
         self.state = state
         if rows:
             self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, self._row.updates
