@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import envs
+from batches import assert_batches_agree, assert_same
 from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
@@ -45,11 +46,6 @@ def starts(count: int, seed: int = 0):
     return state, jnp.asarray(ctrl, f32)
 
 
-def assert_same(a, b) -> None:
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def run(script: str, timeout: float = 180.0) -> subprocess.CompletedProcess[str]:
     """A script in a process of its own, with a working directory that is not written to."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
@@ -68,14 +64,7 @@ def test_numbers_do_not_depend_on_threads_order_or_neighbours(readout):
 
 def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
     state, ctrl = starts(6)
-    step = engine().step
-    flat = jax.jit(jax.vmap(step))(state, ctrl)
-    nested = jax.jit(jax.vmap(jax.vmap(step)))(*jax.tree.map(lambda x: x.reshape(2, 3, -1), (state, ctrl)))
-    assert_same(flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested))
-    shared = jax.jit(jax.vmap(step, in_axes=(0, None)))(state, ctrl[0])
-    assert_same(shared, jax.jit(jax.vmap(step))(state, jnp.tile(ctrl[0], (6, 1))))
-    first = jax.tree.map(lambda x: x[0], (state, ctrl))
-    assert_same(step(*first), jax.tree.map(lambda x: x[0], flat))
+    assert_batches_agree(engine().step, state, ctrl)
 
 
 @both

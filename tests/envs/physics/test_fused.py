@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import envs
+from batches import assert_batches_agree, assert_same
 from envs import native, physics
 from envs.ant import walls
 from envs.errors import TaskError
@@ -195,11 +196,6 @@ def engine(**options):
     return physics.make_engine(walls.model(), substeps=5, readout=readout, physics="fused", **options)
 
 
-def assert_same(a, b) -> None:
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def test_numbers_do_not_depend_on_threads_order_or_neighbours():
     state, ctrl = ants(37)
     lone = jax.jit(jax.vmap(engine(threads=1).step))(state, ctrl)
@@ -254,12 +250,7 @@ def test_calls_at_once_do_not_wait_for_one_another():
 def test_nested_vmap_unbatched_arguments_and_no_vmap_agree():
     state, ctrl = ants(6)
     step = engine().step
-    flat = jax.jit(jax.vmap(step))(state, ctrl)
-    nested = jax.jit(jax.vmap(jax.vmap(step)))(*jax.tree.map(lambda x: x.reshape(2, 3, -1), (state, ctrl)))
-    assert_same(flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested))
-    shared = jax.jit(jax.vmap(step, in_axes=(0, None)))(state, ctrl[0])
-    assert_same(shared, jax.jit(jax.vmap(step))(state, jnp.tile(ctrl[0], (6, 1))))
-    assert_same(step(*jax.tree.map(lambda x: x[0], (state, ctrl))), jax.tree.map(lambda x: x[0], flat))
+    assert_batches_agree(step, state, ctrl)
     none = jax.jit(jax.vmap(step))(*jax.tree.map(lambda x: x[:0], (state, ctrl)))
     assert none[0].qpos.shape == (0, 15)
 
