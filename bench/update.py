@@ -130,7 +130,7 @@ def _actor(setup: Setup) -> Fit:
     samples = PolicySamples(obs, action, full, zero, mean, full / 3, advantage, cost, zero, zero + 1)
     params = jax.tree.map(lambda x: x[0], setup.nets.init_actor(jax.random.key(2)))
     now = schedules.at(setup.config, setup.hyper, jnp.int32(0))
-    return params, policies.policy_loss(setup, setup.hyper, now, samples, 0.0), samples
+    return params, policies.policy_loss(setup, setup.hyper, now, samples, jnp.zeros(1)), samples
 
 
 # What a loop's body names besides what it launches.

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import jax
 
 from .progress import announce
+from .versions import installed_version
 
 HEADER = pathlib.Path(__file__).parent / "native.h"
 INSTALL = "install g++ or clang++, or pip install 'pmt-jax[native]'"
@@ -206,7 +207,7 @@ def _command(compiler: Compiler, code: Code) -> list[str]:
 
 def _key(compiler: Compiler, code: Code) -> str:
     sources = [source.read_text() for source in code.sources]
-    parts = (*sources, code.made, compiler.version, _command(compiler, code), cpu_flags(), jax.lib.__version__)
+    parts = (*sources, code.made, compiler.version, _command(compiler, code), cpu_flags(), installed_version("jaxlib"))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:20]
 
 

@@ -207,7 +207,7 @@ def _check_values(env: Env, name: str) -> None:
             when = f"after step {step}" if step else "after reset"
             raise TaskError(f"{name}: {field} is not finite {when}")
     low, high = found["cost"].min(), found["cost"].max()
-    if out_of_range(np.stack([low, high])).any():
+    if out_of_range(jnp.stack([low, high])).any():
         raise TaskError(f"{name}: costs must be within [0, 1], but the first steps give {low if low < 0 else high:g}")
     if shares_cost(env) and np.ptp(found["cost"], axis=1).any():
         raise TaskError(f"{name}: it has shares_cost = True, but its agents' costs differ; leave shares_cost out")

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 
 from ..base import Env, State
 from ..errors import TaskError
@@ -39,7 +39,7 @@ def boxes(env: Env, batch: tuple[int, ...] = ()) -> dict[str, Box]:
     }
 
 
-def action(given: Any, space: Box, what: str) -> np.ndarray:
+def action(given: Any, space: Space, what: str) -> np.ndarray:
     """`given` as an array of `space`, whose bounds are the task's own business.
 
     Raises:

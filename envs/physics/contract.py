@@ -1,7 +1,7 @@
 """The contract of all engines: their state, their protocol, which of them can run here, and the versions they need."""
 
 # mujoco is a binary module without stubs:
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
 from __future__ import annotations
 
 import dataclasses

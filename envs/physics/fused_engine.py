@@ -5,6 +5,8 @@ are double, whatever the arrays are. On NVIDIA GPUs a world is a warp of 32 thre
 have one order there too, so runs repeat bit for bit.
 """
 
+# mujoco is a binary module without stubs:
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from typing import TYPE_CHECKING

@@ -175,9 +175,7 @@ def update_policy(
     return TrainState(params, new.opt_state), jnp.zeros(()), metrics
 
 
-def policy_loss(
-    setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySamples, violation: jax.Array | float
-) -> Loss:
+def policy_loss(setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySamples, violation: jax.Array) -> Loss:
     """What epochs minimise, of one policy's weights and a minibatch of `samples`: the method's surrogate and penalty.
 
     Args:

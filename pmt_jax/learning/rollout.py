@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +102,7 @@ def collect(
     return state, batch, raw
 
 
-def _record(seen: dict[str, jax.Array | None], outcome: Outcome, sums: RolloutState) -> Batch:
+def _record(seen: dict[str, Any], outcome: Outcome, sums: RolloutState) -> Batch:
     return Batch(
         **seen,
         reward=outcome.reward,

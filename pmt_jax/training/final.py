@@ -11,9 +11,7 @@ import json
 import math
 import pathlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..config.methods import label
 from ..files import Note, read_rows, replace_text, to_stderr
@@ -32,7 +30,7 @@ def episodes(setup: Setup) -> int:
     return -(-EPISODES // parts) * parts
 
 
-def rows(setup: Setup, step: int, results: Mapping[str, np.ndarray], left_out: set[int]) -> list[Row]:
+def rows(setup: Setup, step: int, results: Mapping[str, Any], left_out: set[int]) -> list[Row]:
     """The lines of evaluation.jsonl.
 
     Args:

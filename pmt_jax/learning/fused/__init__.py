@@ -116,7 +116,7 @@ def apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
         weights += [norms[i][name] for name in ("scale", "bias")] if module.layer_norm and i < last else []
     widths = (x.shape[-1], *module.hidden, module.outputs)
     shape = _Shape(widths, module.activation, module.layer_norm, module.input_norm)
-    out = _network(shape, weights, jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]))
+    out: jax.Array = _network(shape, weights, jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]))
     return out.reshape(*x.shape[:-1], module.outputs)
 
 
