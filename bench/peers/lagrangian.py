@@ -1,7 +1,7 @@
 """MAPPO-Lagrangian in PyTorch, as one would write it for a gymnasium vector environment.
 
 The method is ours (docs/methods/mappo_l.md): agents are updated one after the other, each with the factor of those
-before it; the multiplier follows the cost rate. Its critics see all agents' observations, which is what the vector
+before it; the multiplier follows the average cost. Its critics see all agents' observations, which is what the vector
 environment gives of the step that ends an episode.
 """
 
@@ -20,6 +20,9 @@ from torch.distributions import Normal
 from envs import adapters
 from envs.base import Env, EnvSpec
 from pmt_jax import Config
+from pmt_jax.learning.constraint import LAMBDA_MIN
+from pmt_jax.learning.maths.running_moments import RETURNS_DECAY
+from pmt_jax.learning.policies import COST_STD_FLOOR
 
 from .report import Report
 
@@ -31,7 +34,7 @@ class Batch(NamedTuple):
 
     Attributes:
       obs, next_obs: [N, O], the next before any reset; action: [N, A]; log_prob: [N].
-      signal: [1 + N], the team's reward and each agent's cost.
+      signal: [1 + N], the team's reward and each agent's cost in units of the limit.
       terminated, done: [1] bool.
     """
 
@@ -95,12 +98,14 @@ class Learner:
 
     def __init__(self, config: Config, spec: EnvSpec) -> None:
         inputs, agents = spec.obs_dim, spec.num_agents
-        self.config, self.rate_limit = config, float(np.sum(spec.cost_limit)) / spec.horizon
+        self.config, self.horizon = config, spec.horizon
+        self.unit = spec.horizon / (float(np.sum(spec.cost_limit)) * (1 - config.cost_margin))
         self.actors = [mlp(inputs, config.hidden, spec.action_dim, 0.01) for _ in range(agents)]
         self.logits = [nn.Parameter(torch.ones(spec.action_dim, device=DEVICE)) for _ in range(agents)]
         self.critics = [mlp(agents * inputs, config.hidden, heads, 1.0) for heads in (1, agents)]
-        self.seen, self.returns = Moments(inputs), Moments(1 + agents, config.value_norm_decay)
+        self.seen, self.returns = Moments(inputs), Moments(1 + agents, RETURNS_DECAY)
         self.multiplier = torch.full((agents,), config.lambda_init, device=DEVICE)
+        self.estimate = torch.ones(agents, device=DEVICE)  # an episode's cost in units of the limit
         self.adam = [
             torch.optim.Adam([*actor.parameters(), logit], eps=1e-5)
             for actor, logit in zip(self.actors, self.logits, strict=True)
@@ -126,7 +131,8 @@ class Learner:
     def update(self, batch: Batch, steps: int) -> None:
         """Fits actors, multipliers and critics to a rollout that ends after `steps` environment steps."""
         config, obs = self.config, self.seen.scaled(batch.obs)
-        decay = 0.5 ** (steps / config.lr_half_life)
+        decay = config.lr_end ** (steps / config.steps)
+        excess = self._excess(batch)
         with torch.no_grad():
             mean, std, next_obs = self.returns.mean, self.returns.std, self.seen.scaled(batch.next_obs)
             value, after = (mean + std * self.values(x) for x in (obs, next_obs))
@@ -134,8 +140,9 @@ class Learner:
         target = advantage + value
         advantage = (advantage - advantage.mean((0, 1))).flatten(0, 1)
         reward, cost = advantage[:, :1], advantage[:, 1:]
-        cost = cost / cost.std(0).clamp(min=config.cost_std_floor)
-        hybrid = reward / (reward.std() + 1e-5) - self.multiplier * cost
+        cost = cost / cost.std(0).clamp(min=COST_STD_FLOOR)
+        price = (self.multiplier + config.lambda_kp * excess).clamp(0, config.lambda_max)
+        hybrid = reward / (reward.std() + 1e-5) - price * cost
         rows = Batch(*(x.flatten(0, 1) for x in batch))
         factor = torch.ones_like(hybrid[:, 0])
         for agent in torch.randperm(len(self.actors)).tolist():
@@ -144,9 +151,15 @@ class Learner:
             )
         self.returns.update(target)
         self._fit_critics(obs.flatten(0, 1), self.returns.scaled(value), self.returns.scaled(target), decay)
-        excess = batch.signal[..., 1:].mean((0, 1)) - self.rate_limit
-        self.multiplier = (self.multiplier + config.lambda_lr * excess).clamp(0, config.lambda_max)
+        lowest, gain = LAMBDA_MIN * config.lambda_init, config.lambda_lr / config.num_updates
+        self.multiplier = (self.multiplier * (gain * excess).exp()).clamp(lowest, config.lambda_max)
         self.seen.update(batch.obs)
+
+    def _excess(self, batch: Batch) -> Tensor:
+        """[N], how far the moving average of costs, in units of the limit, is beyond it; within [-1, 1]."""
+        share = min(1.0, len(batch.signal) / self.horizon)
+        self.estimate = self.estimate + share * (batch.signal[..., 1:].mean((0, 1)) - self.estimate)
+        return (self.estimate - 1).clamp(-1, 1)
 
     def _fit_actor(self, agent: int, obs: Tensor, rows: Batch, advantage: Tensor, decay: float) -> Tensor:
         """PPO on one agent's rows; the ratio of its new policy to its old one [T * B]."""
@@ -165,11 +178,11 @@ class Learner:
     def _fit_critics(self, obs: Tensor, old: Tensor, target: Tensor, decay: float) -> None:
         """Clipped Huber loss in normalised units; `old` and `target` are [T, B, 1 + N]."""
         obs, old, target = obs.flatten(1), old.flatten(0, 1), target.flatten(0, 1)
-        heads = (slice(0, 1), slice(1, None))
+        heads = ((slice(0, 1), self.config.clip), (slice(1, None), math.inf))
         for part in self._minibatches(len(obs)):
-            for critic, adam, head in zip(self.critics, self.critic_adam, heads, strict=True):
+            for critic, adam, (head, clip) in zip(self.critics, self.critic_adam, heads, strict=True):
                 value, before, goal = critic(obs[part]), old[part][:, head], target[part][:, head]
-                clipped = before + (value - before).clamp(-self.config.clip, self.config.clip)
+                clipped = before + (value - before).clamp(-clip, clip)
                 errors = [nn.functional.huber_loss(x, goal, reduction="none", delta=10.0) for x in (value, clipped)]
                 self._step(adam, torch.maximum(*errors).mean(), decay * self.config.critic_lr)
 
@@ -203,7 +216,7 @@ def train(config: Config, env: Env, report: Report) -> None:
             cost, done = info["cost"].sum(-1), terminated | truncated
             sums += np.stack([reward, cost.mean(1)], 1)
             ended, sums[done] = [*ended, *sums[done]][-100:], 0
-            signal = np.concatenate([reward[:, None], cost], 1)
+            signal = np.concatenate([reward[:, None], cost * learner.unit], 1, dtype=np.float32)
             happened = (_tensor(x) for x in (signal, terminated[:, None], done[:, None]))
             steps.append(Batch(before, _tensor(info.get("final_obs", obs)), action, log_prob, *happened))
         learner.update(Batch(*map(torch.stack, zip(*steps, strict=True))), update * config.batch_size)

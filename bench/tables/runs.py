@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 import pathlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,12 @@ HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table
 OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
 OLD |= {"lambda_rule": "integral", "cost_advantage": "std", "fear_history": "rollout"}  # these are no settings any more
 OLD |= {"regret_mask": "top", "regret_target": "mode", "cost_false": 0.0}
+# Of runs before costs were counted in units of the limit (docs/design/earlier.md): what was the default then.
+OLD |= {"cost_value_clip": math.nan, "max_grad_norm": 10.0, "lambda_kp": 0.0, "limit_lr": 0.0, "lambda_unit": "step"}
+OLD |= {"cost_std_floor": 0.05, "cost_estimate": "episode", "episode_starts": "together", "lr_half_life": math.inf}
+OLD |= {"kl_half_life": math.inf, "std_half_life": math.inf, "std_decay_start": 0.0, "actor_lr_half_life": math.inf}
+OLD |= {"value_norm_decay": 0.995, "limit_windup": 1.0, "lambda_lr": 0.1, "surrogate_weight": 1.0, "lambda_kd": 0.0}
+OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmt_jax.config.settings import Config
 from pmt_jax.formats import markdown
 from pmt_jax.studies.statistics import holm, u_test
 
@@ -30,8 +29,7 @@ def measures(run: runs.Run) -> dict[str, Scores]:
 
 def settings(run: runs.Run) -> dict[str, Any]:
     """The run's settings; those that are newer than it have what was done before."""
-    used = {name: getattr(Config, name) for name in ("cost_seen", "cost_value_clip", "max_grad_norm")}
-    return used | runs.OLD | _config(run["config"])
+    return {"cost_seen": 1.0} | runs.OLD | _config(run["config"])
 
 
 @functools.cache  # a table asks for the settings of a run many times

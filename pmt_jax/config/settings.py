@@ -22,7 +22,6 @@ from .fields import (
     POSITIVE,
     POSITIVE_OR_INF,
     SHARE,
-    STEPS_OR_INF,
     Bound,
     common,
     constraint,
@@ -47,43 +46,19 @@ class Hyper:
 
     actor_lr: float = learning(3e-4, "learning rate of the actors (Adam)", NOT_NEGATIVE)
     critic_lr: float = learning(1e-3, "learning rate of the reward critic and of the cost critic (Adam)", NOT_NEGATIVE)
-    lr_half_life: float = learning(
-        math.inf,
-        "environment steps of a seed in which all learning rates halve; inf keeps them",
-        STEPS_OR_INF,
+    lr_end: float = learning(
+        1.0,
+        "share of all learning rates that is left at the end of the run; they fall exponentially, and the trust region "
+        "by the square",
+        Bound("be a share above 0 and at most 1", lambda x: 0 < x <= 1),
     )
     kl_max: float = learning(
         math.inf,
         "bound on how far an update by clipped epochs moves a policy, mean KL in nats; a longer step is shortened",
         Bound("be a number of nats above 0, or inf", lambda x: x > 0),
     )
-    kl_half_life: float = learning(
-        math.inf,
-        "environment steps of a seed in which kl_max and kl_limit halve; inf keeps them. A step's divergence is the "
-        "square of its length, so half of lr_half_life shrinks both alike",
-        STEPS_OR_INF,
-    )
-    std_half_life: float = learning(
-        math.inf,
-        "environment steps of a seed in which the noise of actions, their standard deviation, halves after "
-        "std_decay_start, on top of what the policies learn of it; inf leaves it to them",
-        STEPS_OR_INF,
-    )
-    std_decay_start: float = learning(
-        0.0,
-        "environment steps of a seed after which std_half_life and actor_lr_half_life count: a policy needs noise to "
-        "learn, so late is better",
-        NOT_NEGATIVE,
-    )
-    actor_lr_half_life: float = learning(
-        math.inf,
-        "environment steps of a seed in which the steps of policies halve after std_decay_start: actor_lr and, by its "
-        "square, kl_limit; inf keeps them. Ratios count a step of the mean action in units of the noise: take the "
-        "length of std_half_life",
-        STEPS_OR_INF,
-    )
     max_grad_norm: float = learning(
-        10.0,
+        math.inf,
         "gradients are scaled down to this global norm; inf leaves them. Those of a policy grow with its multiplier",
         POSITIVE_OR_INF,
     )
@@ -92,19 +67,12 @@ class Hyper:
     clip: float = learning(
         0.2, "half-width of the interval to which probability ratios and values are clipped", POSITIVE
     )
-    cost_value_clip: float = learning(
-        math.nan,
-        "half-width of the interval of cost values alone, in standard deviations of the returns; nan takes that of "
-        "clip. A clipped value moves by little more than this an update, too slowly for rare costs; inf clips none",
-        Bound("be a number above 0, inf, or nan for that of clip", lambda x: math.isnan(x) or x > 0),
-    )
     entropy_coef: float = learning(
         0.0,
         "weight of the policy's entropy, in nats summed over action dimensions; below 0 the noise of actions falls "
         "faster",
         Bound("be a number that fits 32 bits", lambda x: -FLOAT32_MAX <= x <= FLOAT32_MAX),
     )
-    value_norm_decay: float = learning(0.995, "share of the running moments of returns that survives an update", SHARE)
     cost_limit: float | tuple[float, ...] = constraint(
         math.nan,
         "allowed undiscounted cost of one agent per episode, one number for every cost or a list with one for each; "
@@ -124,11 +92,14 @@ class Hyper:
     )
     lambda_init: float = constraint(0.78, "multiplier before the first update", NOT_NEGATIVE)
     lambda_lr: float = constraint(
-        0.1, "step of the multiplier per update, for an excess of 1 in `lambda_unit`", NOT_NEGATIVE
+        4.0,
+        "how far costs of twice the limit in every update of the run move the multiplier: the logarithm of what it is "
+        "multiplied by, and for mappo_pid what is added to it",
+        NOT_NEGATIVE,
     )
     lambda_kp: float = constraint(
-        0.0,
-        "PID: weight of the excess, in `lambda_unit`, that is added to the multiplier; 0 for the integral alone",
+        0.5,
+        "PID: weight of the excess, a share of the limit, that is added to the multiplier; 0 for the integral alone",
         NOT_NEGATIVE,
     )
     lambda_kd: float = constraint(
@@ -138,13 +109,7 @@ class Hyper:
     )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier, and P3O's weight of the penalty", NOT_NEGATIVE)
     surrogate_weight: float = constraint(
-        1.0,
-        "weight of the mean of ratio * cost advantage in the multiplier's step; nan means rollout_length, which "
-        "makes the mean over steps a sum",
-        NOT_NEGATIVE,
-    )
-    cost_std_floor: float = constraint(
-        0.05, "cost advantages are divided by their standard deviation, but never by less than this", NOT_NEGATIVE
+        0.0, "weight of the mean of ratio * cost advantage in the multiplier's step (Eq. 16)", NOT_NEGATIVE
     )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
     fear_lr_start: float = emotion(
@@ -178,30 +143,17 @@ class Hyper:
         0.5, "the weight on the ratio stays within 1 +- kappa * clip; inf for no bound", NOT_NEGATIVE_OR_INF
     )
     limit_lr: float = constraint(
-        0.0, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", SHARE
-    )
-    limit_windup: float = constraint(
-        1.0,
-        "the most that limit_lr lowers the limit by, in multiples of what a step can take off the cost, and at most "
-        "what a step of the first kl_limit could; above 1 more steps only lower the cost as kl_half_life shortens them",
-        POSITIVE_OR_INF,
+        0.1, "step by which MACPO lowers its limit per update, as a share of the cost beyond it", SHARE
     )
     kl_limit: float = constraint(
         0.01, "size of MACPO's trust region, mean KL in nats, and FOCOPS's bound on the KL of each sample", POSITIVE
     )
     damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
-    first_step: float = constraint(1.0, "first step of MACPO's line search, as a share of the full step", NOT_NEGATIVE)
-    step_decay: float = constraint(0.8, "factor between one step of the line search and the next", NOT_NEGATIVE)
-    kl_slack: float = constraint(1.5, "a step is accepted up to this multiple of kl_limit", NOT_NEGATIVE_OR_INF)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(Hyper):
-    """All settings of a run.
-
-    A number that means another setting (`surrogate_weight = nan`, `trust_steps = 0`) is replaced by that setting's
-    value when the Config is made.
-    """
+    """All settings of a run."""
 
     task: str = common("lane", "what to train on: a task (pmt envs lists them) or a Python file of your own")
     method: str = common("mappo_l", "which method learns: a row of the table in pmt_jax/config/methods.py")
@@ -235,22 +187,9 @@ class Config(Hyper):
         "own rule (SafePO)",
     )
     episode_starts: Literal["together", "spread"] = learning(
-        "together",
+        "spread",
         "environments begin their first episodes at once, or spread over the time limit, so that a batch has all parts "
         "of an episode even where only the time limit ends one",
-    )
-    cost_estimate: Literal["episode", "rate", "average", "critic"] = constraint(
-        "episode",
-        "estimate of the episode cost for the multiplier: mean of the episodes that finished in this update, the cost "
-        "rate of this update's steps times the horizon, that rate's moving average over an episode's time, or the rate "
-        "of the cost critic's values",
-    )
-    lambda_unit: Literal["step", "limit", "relative"] = constraint(
-        "step",
-        "unit of the excess that changes the multiplier: cost per step, or share of the limit, cut at 1, so that one "
-        "lambda_lr fits all limits and horizons; relative: share of the limit less the margin, and the multiplier "
-        "changes in proportion to itself, so that it becomes large soon where a tight limit needs it, down to a "
-        "hundredth of `lambda_init`",
     )
     fear_time: Literal["next", "current"] = emotion(
         "next", "fear of the state to which an action leads, or of the state in which it is taken"
@@ -267,11 +206,6 @@ class Config(Hyper):
         "", "run folder whose fear network is the start, as a prior; agents of another team start with its mean"
     )
     emotion_epochs: int = emotion(4, "passes over the batch for the fear and regret networks", COUNT)
-    trust_steps: int = constraint(
-        1,
-        "trust-region steps of MACPO per update, each on its part of the batch; 0 means as many as minibatches",
-        COUNT,
-    )
     physics: Literal["auto", "fused", "mjx", "warp", "mujoco"] = simulation(
         "auto", "simulation engine; auto takes the fastest for the device"
     )
@@ -285,13 +219,8 @@ class Config(Hyper):
     eval_episodes: int = output(32, "episodes per seed of an evaluation during training", COUNT)
 
     def __post_init__(self) -> None:
-        if math.isnan(self.surrogate_weight):
-            object.__setattr__(self, "surrogate_weight", float(self.rollout_length))
-        for name in ("fear_start", "cost_value_clip"):
-            if math.isnan(getattr(self, name)):  # always the same nan, so that equal settings compare equal
-                object.__setattr__(self, name, math.nan)
-        if self.trust_steps == 0:
-            object.__setattr__(self, "trust_steps", self.minibatches)
+        if math.isnan(self.fear_start):  # always the same nan, so that equal settings compare equal
+            object.__setattr__(self, "fear_start", math.nan)
         _validate(self)
 
     @property
@@ -337,16 +266,13 @@ def _validate(config: Config) -> None:
         raise UsageError(f"seed must lie between 0 and 2**31 - seeds, not {config.seed}")
     if config.lambda_init > config.lambda_max:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
-    if config.lambda_unit == "relative" and not config.lambda_init:
-        raise UsageError("with lambda_unit = relative a multiplier of 0 never moves; set lambda_init above 0")
+    if config.lambda_max and not config.lambda_init:
+        raise UsageError(
+            "a multiplier of 0 never moves, for it changes in proportion to itself; set lambda_init above 0"
+        )
     for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
         if option in dict(config.env):
             raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")
-    if config.cost_estimate == "critic" and config.gamma == 1:
-        raise UsageError(
-            "cost_estimate = critic takes (1 - gamma) times the value for the cost of a step, which is 0; set gamma "
-            "below 1 or take another cost_estimate"
-        )
     _validate_sizes(config)
 
 
@@ -363,6 +289,8 @@ def _validate_sizes(config: Config) -> None:
         )
     if config.num_updates > INT32_MAX:
         raise UsageError(f"steps = {config.steps} is more than 2**31 updates of {config.batch_size} steps")
-    for parts, what in ((config.minibatches, "equal minibatches"), (config.trust_steps, "trust steps")):
-        if config.batch_size % parts:
-            raise UsageError(f"a batch of {config.batch_size} steps cannot be cut into {parts} {what}; take a divisor")
+    if config.batch_size % config.minibatches:
+        raise UsageError(
+            f"a batch of {config.batch_size} steps cannot be cut into {config.minibatches} equal minibatches; "
+            "take a divisor"
+        )

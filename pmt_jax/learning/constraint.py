@@ -1,7 +1,7 @@
 """The constraint, from the costs of a batch to what the policies pay for them.
 
-    costs -> estimate of an episode's cost -> excess over the limit (Eq. 11) -> price in the policies' loss (Eq. 10)
-          -> the policies change -> the multiplier's step (Eq. 16, 17)
+    costs -> in units of the limit -> estimate of an episode's cost -> excess (Eq. 11) -> price in the policies' loss
+          (Eq. 10) -> the policies change -> the multiplier's step (Eq. 16, 17)
 
 A trust region has no multiplier. It keeps the limit itself, and lowers it while costs stay beyond it.
 """
@@ -14,85 +14,71 @@ import jax
 import jax.numpy as jnp
 
 from ..limits import columns
-from .rollout import finished_mean
-from .schedules import Schedule
 from .setup import Setup, limit_less_margin
 from .types import Batch, Constraint, Hyper, Metrics, PolicySamples
 
-LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls that changes in proportion to itself
+LAMBDA_MIN = 0.01  # share of lambda_init below which no multiplier falls
 
 
 def init(setup: Setup, hyper: Hyper) -> Constraint:
     """The constraint before the first update: the estimate is the target, so that there is no excess yet."""
     heads = (setup.vector.spec.num_agents, setup.vector.spec.num_costs)
     return Constraint(
-        estimate=jnp.full(heads, target(hyper)),
+        estimate=jnp.full(heads, goal(hyper)),
         multiplier=jnp.full(heads, hyper.lambda_init * (setup.method.constraint in ("lagrangian", "pid"))),
         lowered=jnp.zeros(heads),
     )
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# The unit of costs, the estimate, and the excess
+
+
 def target(hyper: Hyper) -> jax.Array:
-    """What the learner holds an episode's cost to, [K]: the limit d, less the margin, a share of it."""
+    """What the learner holds an episode's cost to, [] or [K]: the limit d, less the margin, a share of it."""
     return limit_less_margin(hyper, hyper.cost_margin)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Estimate and excess
+def in_limits(hyper: Hyper, cost: jax.Array, horizon: int) -> jax.Array:
+    """Costs of steps [..., K], or fear of them, in units of the limit: c L / d; their mean over an episode is J / d.
+
+    The learner sees costs in this unit alone, so no other setting depends on the limit, on the horizon L or on how
+    often costs are noticed. A limit of 0 is no unit; costs are then counted as if one were allowed.
+    """
+    limit = target(hyper)
+    return cost * (horizon / jnp.where(limit > 0, limit, 1.0))
 
 
-def estimate_cost(
-    how: str, horizon: int, batch: Batch, previous: jax.Array, cost_value: jax.Array, gamma: jax.Array | float
-) -> jax.Array:
-    """The undiscounted cost per episode [N, K] that the constraint is held against.
+def goal(hyper: Hyper) -> jax.Array:
+    """What the learner holds an episode's cost to in units of the limit, [] or [K]: 1, or 0 for a limit of 0."""
+    return (target(hyper) > 0).astype(jnp.float32)
 
-    `episode`: mean over the episodes that ended in this batch, `previous` if none did. `rate`: mean cost per step
-    times the horizon; no lag, for batches much shorter than an episode. `average`: the rate's moving average, in which
-    a batch has the weight of its share of an episode's time. It is for an excess that is cut (`relative_excess`):
-    where few batches have costs, cut rates are lower on average than the rate is. `critic`: (1 - gamma) times the
-    mean cost value, times the horizon.
+
+def estimate_cost(hyper: Hyper, batch: Batch, previous: jax.Array, horizon: int) -> jax.Array:
+    """The undiscounted cost of an episode that the constraint is held against, in units of the limit [N, K].
+
+    A moving average of the mean cost per step, in which a batch has the weight of its share of an episode's time. It
+    needs no episode that ends, and no batch that sees all parts of one. Where few batches have costs, an excess that
+    is cut would be lower on average without it.
 
     Args:
-      how: `cost_estimate`; horizon: in steps; previous: [N, K], the estimate before.
-      cost_value: [T, B, N, K] of the batch's states, discounted by gamma.
+      previous: [N, K], the estimate before; horizon: in steps.
     """
-    rate = horizon * batch.cost.mean((0, 1))
-    match how:
-        case "critic":
-            return (1 - gamma) * horizon * cost_value.mean((0, 1))
-        case "rate":
-            return rate
-        case "average":
-            return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
-        case _:
-            return jnp.where(batch.finished.any(), finished_mean(batch, batch.episode_cost), previous)
+    rate = in_limits(hyper, batch.cost, horizon).mean((0, 1))
+    return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
 
 
-def cost_excess(episode_cost: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
-    """How far the cost is beyond its limit, as cost per step: S = (J - d) / L; positive is too dangerous (Eq. 11).
+def cost_excess(hyper: Hyper, estimate: jax.Array) -> jax.Array:
+    """How far costs [..., K] in units of the limit are beyond it: S = (J - d) / d; positive is too dangerous (Eq. 11).
 
-    Args:
-      episode_cost: J [...], undiscounted cost per episode; limit: d in the same unit; horizon: L, in steps.
+    The paper's is a cost per step, (J - d) / L. As a share of the limit an equal excess is as serious at every limit.
     """
-    return (episode_cost - limit) / horizon
+    return estimate - goal(hyper)
 
 
-def relative_excess(excess: jax.Array, limit: jax.Array | float, horizon: int) -> jax.Array:
-    """An excess [...] in cost per step as a share of the limit, within [-1, 1]: (J - d) / d, cut at 1.
-
-    An equal share gives an equal step at every limit. The cut bounds the step of a cost far beyond its limit. Where a
-    margin is kept, the excess over `target` can be a share of the limit or of the target.
-    """
-    return jnp.clip(excess * horizon / jnp.maximum(limit, 1e-6), -1.0, 1.0)
-
-
-def excess_in_lambda_unit(setup: Setup, hyper: Hyper, excess: jax.Array) -> jax.Array:
-    """An excess [..., K] in cost per step, in the unit that the multiplier's gains are for (`lambda_unit`)."""
-    if setup.config.lambda_unit == "step":
-        return excess
-    # In proportion to itself, a multiplier falls as fast without costs as it rises with too many.
-    limit = target(hyper) if setup.config.lambda_unit == "relative" else limit_less_margin(hyper, 0.0)
-    return relative_excess(excess, limit, setup.vector.horizon)
+def cut(excess: jax.Array) -> jax.Array:
+    """An excess [...] within [-1, 1]: costs far beyond the limit raise a multiplier as fast as no costs lower it."""
+    return jnp.clip(excess, -1.0, 1.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -103,15 +89,15 @@ def price(setup: Setup, hyper: Hyper, multiplier: jax.Array, excess: jax.Array, 
     """What the policies weigh costs with [N, K]: the multiplier, which PID takes as its integral, and two gains more.
 
     Args:
-      multiplier: [N, K]; excess: [N, K] of this update, in cost per step; estimate: [N, K] of the update before.
+      multiplier: [N, K]; excess: [N, K] of this update; estimate: [N, K] of the update before.
     """
     if setup.method.constraint == "switching":
         return switching(excess)
     if setup.method.constraint not in ("lagrangian", "pid"):
         return multiplier
-    previous = cost_excess(estimate, target(hyper), setup.vector.horizon)
-    now, before = (excess_in_lambda_unit(setup, hyper, x) for x in (excess, previous))
-    return pid(multiplier, now, before, hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max)
+    return pid(
+        multiplier, cut(excess), cut(cost_excess(hyper, estimate)), hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max
+    )
 
 
 def pid(
@@ -128,7 +114,7 @@ def pid(
     answers at once when the excess changes sign. A cost that falls adds nothing (Stooke et al., 2020, Algorithm 2).
 
     Args:
-      integral: I [...]; excess, previous_excess: S [...] of this update and of the last, in the same unit.
+      integral: I [...]; excess, previous_excess: S [...] of this update and of the last, in units of the limit.
     """
     change = jnp.maximum(excess - previous_excess, 0.0)
     return jnp.clip(integral + lambda_kp * excess + lambda_kd * change, 0.0, lambda_max)
@@ -141,7 +127,7 @@ def switching(excess: jax.Array) -> jax.Array:
     otherwise it raises the reward alone. The paper's tolerance is a `cost_margin` below 0 there; here it is at least 0.
 
     Args:
-      excess: [N, K], S of this update, in any unit that costs share.
+      excess: [N, K], S of this update, in units of the limit.
     """
     worst = jax.nn.one_hot(excess.argmax(-1), excess.shape[-1])
     return worst * (excess > 0)
@@ -162,20 +148,18 @@ def weights(setup: Setup, price: jax.Array) -> tuple[jax.Array | float, jax.Arra
 def integrate(setup: Setup, hyper: Hyper, constraint: Constraint, excess: jax.Array) -> Constraint:
     """The constraint before the policies change: `pid` adds this update's excess [N, K] to its integral first.
 
-    I <- (I + K_I S)_+, with K_I = `lambda_lr`, then lambda = (I + K_P S + K_D (S - S_previous)_+)_+ is the price of
+    I <- (I + K_I S)_+, with K_I = `gain`, then lambda = (I + K_P S + K_D (S - S_previous)_+)_+ is the price of
     this update (Stooke et al., 2020, Algorithm 2), both of them at most `lambda_max`.
     """
     if setup.method.constraint != "pid":
         return constraint
-    step = excess_in_lambda_unit(setup, hyper, excess)
-    updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
+    updated = dual_update(constraint.multiplier, cut(excess), gain(setup, hyper), hyper.lambda_max)
     return dataclasses.replace(constraint, multiplier=updated)
 
 
 def respond(
     setup: Setup,
     hyper: Hyper,
-    now: Schedule,
     constraint: Constraint,
     samples: PolicySamples,
     excess: jax.Array,
@@ -185,34 +169,35 @@ def respond(
     """One agent's constraint [K] after its policy has changed.
 
     Args:
-      samples: the agent's, [R, ...]; excess: [K] in cost per step; log_ratio: [R], by how much the policy changed.
-      reach: [] cost per step, the most that a step of the trust region promised to take off the cost.
+      samples: the agent's, [R, ...]; excess: [K]; log_ratio: [R], by how much the policy changed.
+      reach: [], the most that a step of the trust region promised to take off the cost, in units of the limit.
     """
     if setup.method.constraint == "trust_region":
-        lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, now.limit_windup * reach)
+        lowered = lower_limit(constraint.lowered, excess, hyper.limit_lr, reach)
         return dataclasses.replace(constraint, lowered=lowered)
     if setup.method.constraint != "lagrangian":
         return constraint
     surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
-    step = excess_in_lambda_unit(setup, hyper, excess + hyper.surrogate_weight * surrogate)
-    if setup.config.lambda_unit == "relative":
-        lowest = LAMBDA_MIN * hyper.lambda_init
-        updated = relative_update(constraint.multiplier, step, hyper.lambda_lr, lowest, hyper.lambda_max)
-    else:
-        updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
+    step, lowest = cut(excess + hyper.surrogate_weight * surrogate), LAMBDA_MIN * hyper.lambda_init
+    updated = relative_update(constraint.multiplier, step, gain(setup, hyper), lowest, hyper.lambda_max)
     return dataclasses.replace(constraint, multiplier=updated)
 
 
 def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: jax.Array) -> jax.Array:
-    """The change in cost per step that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
+    """The change in cost that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
 
     Args:
       log_ratio, log_weight: [R], after the update; cost_advantage: [R, K], centred.
 
     Returns:
-      [K].
+      [K] in units of the limit.
     """
     return jnp.mean(jnp.exp(log_ratio + log_weight)[:, None] * cost_advantage, axis=0)
+
+
+def gain(setup: Setup, hyper: Hyper) -> jax.Array:
+    """By how much an excess of 1 changes the multiplier in an update; `lambda_lr` is for a whole run of them."""
+    return jnp.asarray(hyper.lambda_lr / setup.config.num_updates)
 
 
 def dual_update(
@@ -224,7 +209,7 @@ def dual_update(
     """One projected gradient step of the multiplier: lambda <- clip(lambda + alpha x, 0, lambda_max) (Eq. 17).
 
     Args:
-      multiplier: [...], lambda; excess: [...], measured and expected, x = S + I in cost per step, or `relative_excess`.
+      multiplier: [...], lambda; excess: [...], measured and expected, x = S + I.
     """
     return jnp.clip(multiplier + lambda_lr * excess, 0.0, lambda_max)
 
@@ -243,7 +228,7 @@ def relative_update(
     costs would take as long to undo, and in the end 0 would never move again.
 
     Args:
-      multiplier: [...], lambda > 0; excess: [...], x, `relative_excess`.
+      multiplier: [...], lambda > 0; excess: [...], measured and expected, x = S + I, in units of the limit, `cut`.
     """
     return jnp.clip(multiplier * jnp.exp(lambda_lr * excess), lambda_min, lambda_max)
 
@@ -270,7 +255,7 @@ def lower_limit(lowered: jax.Array, excess: jax.Array, limit_lr: jax.Array | flo
     far beyond the limit would add up to more than can act, and delay the reward once the limit is kept.
 
     Args:
-      lowered: [...] so far, and excess: S [...], in cost per step; most: `limit_windup` times the most that a
-        step promises to take off the cost, in the same unit.
+      lowered: [...] so far, and excess: S [...], in units of the limit; most: the most that a step promises to take
+        off the cost, in the same unit.
     """
     return jnp.maximum(lowered + limit_lr * jnp.minimum(excess, most - lowered), 0.0)

@@ -15,6 +15,10 @@ from .schedules import Schedule
 from .setup import Setup
 from .types import Batch, Critic, Hyper, Metrics, Params
 
+# Eq. 12's clip lets a value move by little more than `clip` an update, too slowly for rare costs. Without it teams had
+# a third to two fifths less cost while they learned, and no other difference was found (docs/results/limits.md).
+UNCLIPPED = jnp.inf
+
 ValueFn = Callable[[Params, jax.Array], jax.Array]
 
 
@@ -48,7 +52,7 @@ def fit_critic(
         returns, both [T, B, ...] in the signal's unit.
     """
     state, old_value, returns = samples
-    moments = running_moments.update_ema(critic.returns, returns, hyper.value_norm_decay)
+    moments = running_moments.update_ema(critic.returns, returns, running_moments.RETURNS_DECAY)
     normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}

@@ -21,9 +21,18 @@ FearLoss = Literal["ce", "gumbel_fwd", "gumbel_rev"]
 
 
 def appraise_fear(
-    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState | None, batch: Batch, key: jax.Array
+    setup: Setup,
+    hyper: Hyper,
+    now: Schedule,
+    net: TrainState | None,
+    batch: Batch,
+    largest: jax.Array,
+    key: jax.Array,
 ) -> tuple[TrainState | None, jax.Array, Metrics]:
-    """Learns from the observed costs first, then computes the fear of every step: [T, B, N, K] in (0, 1).
+    """Learns from the observed costs first, then computes the fear of every step: [T, B, N, K], an expected cost.
+
+    The network's outputs are shares of the `largest` cost so far [N, K], which is 1 where a step costs 0 or 1. So what
+    it learns does not depend on the unit of costs. Before the first cost there is no fear.
 
     Without a fear prior network the signal is the cost itself, or what the method makes of the batch. Calibration is
     that of the network before it has seen the batch.
@@ -32,9 +41,10 @@ def appraise_fear(
         signal = setup.method.cost_signal
         return None, signal(batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
-    net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, batch.cost.mean((0, 1))))
+    share = batch.cost / jnp.where(largest > 0, largest, 1.0)
+    net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, share.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
-    samples = jax.tree.map(flatten_steps, (seen, batch.cost, remembered))
+    samples = jax.tree.map(flatten_steps, (seen, share, remembered))
     noise = jax.random.logistic(jax.random.fold_in(key, 2), samples[1].shape)
 
     def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
@@ -47,7 +57,7 @@ def appraise_fear(
     limits = {"learning_rate": now.fear_lr, "max_grad_norm": hyper.max_grad_norm}
     net, metrics = fit(net, loss, (*samples, noise), key, **limits, **passes)
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
-    return net, fear, {**metrics, **calibration(remembered, batch.cost)}
+    return net, largest * fear, {**metrics, **calibration(remembered, share)}
 
 
 def divergence(

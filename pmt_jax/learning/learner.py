@@ -102,6 +102,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
             else None
         ),
         constraint=constraint.init(setup, hyper),
+        largest_cost=jnp.zeros(heads),
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
         rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
@@ -121,23 +122,25 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
+    largest = jnp.maximum(state.largest_cost, batch.cost.max((0, 1)))
     (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
-        partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
+        partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, largest, tagged[Tag.FEAR]),
         partial(regret.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
     )
 
-    # 3 Advantages of reward and of danger.
+    # 3 Advantages of reward and of danger, which counts in units of the limit.
     seen = critics.inputs(batch)
     value, next_value = critics.values(state.critic, setup.nets.value, seen)
     cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
+    horizon, previous = setup.vector.horizon, state.constraint.estimate
+    cost_signal = constraint.in_limits(hyper, cost_signal, horizon)
     advantage, returns = gae(batch.reward[..., None] if setup.own_critics else batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.
-    horizon, previous = setup.vector.horizon, state.constraint.estimate
-    estimate = constraint.estimate_cost(setup.config.cost_estimate, horizon, batch, previous, cost_value, hyper.gamma)
-    excess = constraint.cost_excess(estimate, constraint.target(hyper), horizon)
+    estimate = constraint.estimate_cost(hyper, batch, previous, horizon)
+    excess = constraint.cost_excess(hyper, estimate)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
     held = constraint.integrate(setup, hyper, state.constraint, excess)
     actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
@@ -145,11 +148,17 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
     samples, cost_samples = (seen[0], value, returns), (seen[0], cost_value, cost_returns)
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
-    cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
     fitted = sharding.in_parallel(
         partial(fit_critic, state.critic, setup.nets.value, hyper.clip, samples, tagged[Tag.CRITIC]),
-        partial(fit_critic, state.cost_critic, setup.nets.cost_value, cost_clip, cost_samples, tagged[Tag.COST_CRITIC]),
+        partial(
+            fit_critic,
+            state.cost_critic,
+            setup.nets.cost_value,
+            critics.UNCLIPPED,
+            cost_samples,
+            tagged[Tag.COST_CRITIC],
+        ),
         partial(update_policies, setup, hyper, now, team, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, held, actor_metrics) = fitted
@@ -157,7 +166,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     computed = {"batch": batch, "cost_signal": cost_signal, "log_weight": log_weight, "advantage": advantage}
     computed |= {"returns": returns, "cost_advantage": cost_advantage, "cost_returns": cost_returns}
     learned = {"critic": critic, "cost_critic": cost_critic, "fear": fear_net, "regret": regret_nets, "actor": actor}
-    learned |= {"constraint": held}
+    learned |= {"constraint": held, "largest_cost": largest}
     check_finite(setup, state.update, **computed, **learned)
     state = dataclasses.replace(state, **learned, update=state.update + 1)
     return state, {

@@ -173,12 +173,6 @@ class Networks:
         """True at the weights of an actor's standard deviation: on these its Fisher matrix is diagonal."""
         return jax.tree_util.tree_map_with_path(lambda path, x: jnp.full(x.shape, path[-1].key == "std"), params)
 
-    def scale_std(self, params: Params, factor: jax.Array) -> Params:
-        """An actor's weights with `factor` times the standard deviation, factor in (0, 1]."""
-        return jax.tree_util.tree_map_with_path(
-            lambda path, x: distributions.scaled(x, factor) if path[-1].key == "std" else x, params
-        )
-
     def layers(self, params: Params) -> dict[str, jax.Array]:
         """The mean's weights under plain names, for every layer i and with a leading [N].
 

@@ -16,12 +16,14 @@ from .maths.losses import clipped_penalty, clipped_surrogate, first_order_surrog
 from .optimise import Loss, fit
 from .schedules import Schedule
 from .setup import Setup
-from .trust_region import trust_region_steps
+from .trust_region import trust_region_step
 from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Tag, TrainState
+
+COST_STD_FLOOR = 2.0  # in units of the limit, so that a batch nearly without cost does not become noise of unit size
 
 
 class Team(NamedTuple):
-    """What an update of policies takes: actors, constraints [N, K], samples [N, R, ...], excess [N, K] a step."""
+    """What an update of policies takes: actors, constraints [N, K], samples [N, R, ...], excess [N, K]."""
 
     actor: TrainState
     constraint: Constraint
@@ -32,7 +34,7 @@ class Team(NamedTuple):
 def update_policies(
     setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
-    """Updates every agent's policy and its constraint; then the noise of actions falls (`std_half_life`).
+    """Updates every agent's policy and its constraint.
 
     Returns:
       actors, constraints [N, K] and metrics, means over agents (`kl_per_agent` [N] in the agents' own order).
@@ -40,7 +42,6 @@ def update_policies(
     update = {"sequential": _sequential, "simultaneous": _simultaneous}[setup.method.order]
     actor, constraint, metrics = update(setup, hyper, now, team, tagged)
     kl = metrics.pop("kl_per_agent")
-    actor = dataclasses.replace(actor, params=setup.nets.scale_std(actor.params, now.std_factor))
     return actor, constraint, {**{k: x.mean(0) for k, x in metrics.items()}, "kl_per_agent": kl}
 
 
@@ -60,7 +61,7 @@ def policy_samples(
         [T, B, N, K]; log_weight: [T, B, N].
     """
     _, advantage = standardise(advantage)
-    centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
+    centred, scaled = standardise(cost_advantage, COST_STD_FLOOR)
     if setup.config.regret_response == "advantage":
         scaled, log_weight = scaled * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
     reward_weight, cost_weight = weights(setup, price)
@@ -96,7 +97,7 @@ def _sequential(
         mine, key = dataclasses.replace(mine, factor=factor), jax.random.fold_in(tagged[Tag.ACTOR], i)
         net, reach, metrics = update_policy(setup, hyper, now, net, mine, excess + own.lowered, key)
         log_ratio, metrics["kl_per_agent"] = policy_change(setup, net.params, mine)
-        own = respond(setup, hyper, now, own, mine, excess, log_ratio, reach)
+        own = respond(setup, hyper, own, mine, excess, log_ratio, reach)
         actor, constraint = jax.tree.map(lambda all_, one: all_.at[i].set(one), (actor, constraint), (net, own))
         # The factor corrects the distribution of the executed joint action: no regret weight in it.
         return (actor, constraint, factor * jnp.exp(log_ratio)), metrics
@@ -126,7 +127,7 @@ def _simultaneous(
 
     params = jax.tree.map(of_all, actor.params)
     log_ratio, metrics["kl_per_agent"] = jax.vmap(lambda *each: policy_change(setup, *each))(params, samples)
-    constraint = jax.vmap(lambda *each: respond(setup, hyper, now, *each))(
+    constraint = jax.vmap(lambda *each: respond(setup, hyper, *each))(
         constraint, samples, excess, log_ratio, of_all(reach)
     )
     return actor, constraint, metrics
@@ -157,20 +158,21 @@ def update_policy(
     """One policy's step on its samples [R, ...]: of a trust region, or epochs of policy gradient (PPO).
 
     Args:
-      violation: [K] cost per step, how far the costs are beyond what the policy is to keep, a lowered limit.
+      violation: [K] in units of the limit, how far costs are beyond what the policy is to keep, a lowered limit.
 
     Returns:
-      the network; [] cost per step, the most that a trust region's step promised to take off the cost, else 0; metrics.
+      the network; [] in units of the limit, the most that a trust region's step promised to take off the cost, else
+      0; metrics.
     """
     if setup.method.constraint == "trust_region":
-        return trust_region_steps(setup, hyper, now, net, samples, violation, key)
+        return trust_region_step(setup, hyper, now, net, samples, violation)
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
     loss = policy_loss(setup, hyper, now, samples, violation)
     new, metrics = fit(net, loss, samples, key, **limits, **passes)
     first_order = setup.method.surrogate == "first_order"
     # Nothing clips FOCOPS's ratios. The paper ends an update beyond this bound; here the step is shortened to it.
-    kl_max = jnp.minimum(now.kl_max, now.kl_limit) if first_order else now.kl_max
+    kl_max = jnp.minimum(hyper.kl_max, now.kl_limit) if first_order else hyper.kl_max
     params, metrics["share_of_step"] = _limit_kl(setup, kl_max, net.params, new.params, samples)
     return TrainState(params, new.opt_state), jnp.zeros(()), metrics
 
@@ -182,7 +184,7 @@ def policy_loss(setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySample
       violation: see `update_policy`; only a penalty reads it.
     """
     penalised = setup.method.constraint == "penalty"
-    scale = jnp.maximum(samples.cost_advantage.std(0) + 1e-5, hyper.cost_std_floor) if penalised else 1.0
+    scale = jnp.maximum(samples.cost_advantage.std(0) + 1e-5, COST_STD_FLOOR) if penalised else 1.0
 
     def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
         mean, std = setup.nets.policy(params, samples.obs)

@@ -1,6 +1,6 @@
 """MACPO's policy step: CPO's constrained trust region for one agent (Achiam et al., 2017; Gu et al., 2023).
 
-From top to bottom: the steps on the parts of a batch, one step, its direction by the exact dual, the line search.
+From top to bottom: the step, its direction by the exact dual, the line search.
 """
 
 from __future__ import annotations
@@ -16,67 +16,36 @@ from jax.flatten_util import ravel_pytree
 from . import sharding
 from .maths import distributions
 from .maths.pytree import pytree
-from .optimise import shuffled
 from .schedules import Schedule
 from .setup import Setup
 from .types import Hyper, Metrics, PolicySamples, TrainState
 
 EPS = 1e-8
 LINE_SEARCH_STEPS = 10
+STEP_DECAY = 0.8  # factor between one step of the line search and the next
+KL_SLACK = 1.5  # a step is accepted up to this multiple of the trust region
 
 Hvp = Callable[[jax.Array], jax.Array]
 
 
-def trust_region_steps(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    net: TrainState,
-    samples: PolicySamples,
-    violation: jax.Array,
-    key: jax.Array,
+def trust_region_step(
+    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, samples: PolicySamples, violation: jax.Array
 ) -> tuple[TrainState, jax.Array, Metrics]:
-    """`trust_steps` constrained steps (MACPO), each on its part of the shuffled samples; one step takes all of them.
+    """One constrained step (MACPO): direction, line search. The optimiser's state is not touched.
 
-    The optimiser's state is not touched. With several costs each step constrains the one most beyond its limit.
+    This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent. Of several costs it
+    constrains the one most beyond its limit.
 
     Args:
-      violation: [K] cost per step, how far each cost is beyond what it is held to.
+      violation: [K] in units of the limit, how far each cost is beyond what it is held to.
 
     Returns:
-      the network; [] cost per step, the most that a step promised to take off the cost; metrics. Means over steps.
+      the network; [] in units of the limit, the most that the step promised to take off the cost; metrics.
     """
     start, unravel = ravel_pytree(net.params)
-    spread = samples.cost_advantage.std(0) + 1e-5
-    worst = jnp.argmax(violation / spread)
+    worst = jnp.argmax(violation / (samples.cost_advantage.std(0) + 1e-5))
+    violation = violation[worst]
     samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[:, worst])
-    steps = setup.config.trust_steps
-    if steps > 1:
-        shuffle = shuffled(key, samples.log_prob.shape[0])
-        samples = jax.tree.map(lambda x: x[shuffle], samples)
-    parts = jax.tree.map(lambda x: x.reshape(steps, -1, *x.shape[1:]), samples)
-
-    def one_step(flat: jax.Array, part: PolicySamples) -> tuple[jax.Array, Metrics]:
-        return _trust_region_step(setup, hyper, now, flat, unravel, part, violation[worst])
-
-    flat, metrics = jax.lax.scan(one_step, start, parts)
-    metrics = {name: x.mean(0) for name, x in metrics.items()}
-    return TrainState(unravel(flat), net.opt_state), metrics["reach"], metrics
-
-
-def _trust_region_step(
-    setup: Setup,
-    hyper: Hyper,
-    now: Schedule,
-    start: jax.Array,
-    unravel: Callable[[jax.Array], Any],
-    samples: PolicySamples,
-    violation: jax.Array,
-) -> tuple[jax.Array, Metrics]:
-    """One constrained step from the flat weights `start` [P]: direction, line search.
-
-    This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent.
-    """
     samples, nets = sharding.shard(samples), setup.nets.plain  # the Fisher matrix takes second derivatives
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -109,19 +78,23 @@ def _trust_region_step(
         better = (loss < loss0) | (direction.case <= 1)
         safe = cost - cost0 <= jnp.maximum(-c, 0.0)
         finite = jnp.isfinite(loss) & jnp.isfinite(cost) & jnp.isfinite(kl)
-        return (kl <= hyper.kl_slack * now.kl_limit) & better & safe & finite
+        return (kl <= KL_SLACK * now.kl_limit) & better & safe & finite
 
-    flat, tried = backtrack(accept, start, direction.step, hyper.first_step, hyper.step_decay)
+    flat, tried = backtrack(accept, start, direction.step)
     loss, _ = objectives(flat)
     _, std = policy(flat)
-    return flat, {
-        "loss": loss,
-        "entropy": distributions.entropy(std, samples.mask).mean(),
-        "std": (std * samples.mask).sum() / samples.mask.sum(),
-        "case": direction.case.astype(loss.dtype),
-        "reach": direction.reach,
-        "line_search_steps": tried.astype(loss.dtype),
-    }
+    return (
+        TrainState(unravel(flat), net.opt_state),
+        direction.reach,
+        {
+            "loss": loss,
+            "entropy": distributions.entropy(std, samples.mask).mean(),
+            "std": (std * samples.mask).sum() / samples.mask.sum(),
+            "case": direction.case.astype(loss.dtype),
+            "reach": direction.reach,
+            "line_search_steps": tried.astype(loss.dtype),
+        },
+    )
 
 
 @pytree
@@ -226,13 +199,9 @@ def _dual(
 
 
 def backtrack(
-    accept: Callable[[jax.Array], jax.Array],
-    start: jax.Array,
-    step: jax.Array,
-    first: jax.Array | float,
-    decay: jax.Array | float,
+    accept: Callable[[jax.Array], jax.Array], start: jax.Array, step: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The first accepted of start + first * decay^j * step, j = 0 .. 9, or `start` if none is.
+    """The first accepted of start + 0.8^j step, j = 0 .. 9, or `start` if none is.
 
     Returns:
       the point [P], and how many were tried in vain (10 if none was accepted).
@@ -244,8 +213,8 @@ def backtrack(
 
     def body(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         count, _ = carry
-        accepted = accept(start + first * decay**count * step)
+        accepted = accept(start + STEP_DECAY**count * step)
         return jnp.where(accepted, count, count + 1), accepted
 
     count, accepted = jax.lax.while_loop(proceed, body, (jnp.int32(0), jnp.asarray(False)))
-    return jnp.where(accepted, start + first * decay**count * step, start), count
+    return jnp.where(accepted, start + STEP_DECAY**count * step, start), count

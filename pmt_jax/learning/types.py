@@ -125,9 +125,9 @@ class Constraint:
     """What the costs of each agent are held by, all [N, K] (see constraint.py).
 
     Attributes:
-      estimate: undiscounted cost per episode.
+      estimate: undiscounted cost of an episode, in units of the limit.
       multiplier: lambda, of PID its integral; 0 without a multiplier.
-      lowered: by how much a trust region keeps below the limit, in cost per step; else 0.
+      lowered: by how much a trust region keeps below the limit, in its unit; else 0.
     """
 
     estimate: jax.Array
@@ -142,7 +142,7 @@ class PolicySamples:
     Attributes:
       obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
       advantage: [R], hybrid: reward less weighted cost.
-      cost_advantage: [R, K], centred, in cost units.
+      cost_advantage: [R, K], centred, in units of the limit.
       log_weight: [R], bias on the probability ratio.
       factor: [R], M: the probability ratios of the agents updated before.
     """
@@ -184,6 +184,7 @@ class LearnerState(ActingState):
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
         without them.
       constraint: estimate of the cost, multiplier and lowered limit, [N, K].
+      largest_cost: [N, K], the largest cost of a step so far that was noticed; fear is a share of it.
       state_moments: [S], of raw states.
       rollout: environments and running sums.
       key: the run's key; update u draws from fold_in(key, u).
@@ -194,6 +195,7 @@ class LearnerState(ActingState):
     fear: TrainState | None
     regret: TrainState | None
     constraint: Constraint
+    largest_cost: jax.Array
     state_moments: RunningMoments
     rollout: RolloutState
     key: jax.Array

@@ -21,7 +21,7 @@ from .load import load_run
 Change = Callable[[LearnerState], LearnerState]
 
 ACTING = ("actor", "obs_moments")  # a pretrained policy has no more
-LEARNED = (*ACTING, "critic", "cost_critic", "fear", "regret", "state_moments")
+LEARNED = (*ACTING, "critic", "cost_critic", "fear", "largest_cost", "regret", "state_moments")
 
 
 def prepare(setup: Setup) -> Change | None:
@@ -83,10 +83,12 @@ def _fear(source: str, like: LearnerState, setup: Setup) -> dict[str, Any]:
     if not isinstance(state, LearnerState) or state.fear is None:
         raise UsageError(f"{source} has no fear network; init_fear needs a run folder of f4sg or mixed")
     ours, theirs = setup.vector.spec, other.vector.spec
-    params = state.fear.params
+    params, largest = state.fear.params, state.largest_cost
     if ours.num_agents != theirs.num_agents and ours.num_costs == theirs.num_costs:
         params = _shared_by_agents(params, other.nets.fear_head, theirs.num_agents, ours.num_agents)
+        largest = jnp.repeat(largest.max(1, keepdims=True), ours.num_agents, 1)
     return {
+        "largest_cost": _taken(source, "largest_cost", largest, like.largest_cost),
         "fear": _taken(source, "fear", params, like.fear),
         "state_moments": _taken(source, "state_moments", state.state_moments, like.state_moments),
     }

@@ -131,18 +131,17 @@ def _extreme_settings(setup: Setup, index: int) -> dict[str, float]:
     hyper = jax.device_get(setup.vmap_arguments[0])
     values = {name: np.asarray(getattr(hyper, name)) for name in HYPER_FIELDS if name != "cost_limit"}
     own = {name: float(x[index] if x.ndim else x) for name, x in values.items()}
-    usual = {name: 1.0 if name.endswith("_lr") else 1e6 for name in own}
-    usual |= {name: math.inf for name in own if name.endswith("_half_life") or name == "std_decay_start"}
+    usual = {name: 1.0 if name.endswith("_lr") and name != "lambda_lr" else 1e6 for name in own}
     return {name: x for name, x in own.items() if usual[name] < x < math.inf}
 
 
 def _divergence(row: Row, where: str) -> str | None:
-    for critic, unit in (("critic", "reward"), ("cost_critic", "cost")):
+    for critic, unit in (("critic", "reward"), ("cost_critic", "cost")):  # costs in units of the limit
         mean, std = row[f"{critic}/return_mean"], row[f"{critic}/return_std"]
         scale = max(1.0, abs(row[f"step_{unit}"]))
         if max(abs(mean), std) > MAX_RETURN * scale:
             return (
-                f"the {critic} {where} diverged: its returns are {mean:.2g} +- {std:.2g} {unit} units, where a step's "
+                f"the {critic} {where} diverged: its returns are {mean:.2g} +- {std:.2g}, where a step's "
                 f"{unit} is {row[f'step_{unit}']:.2g}; try a smaller critic_lr, gamma or gae_lambda"
             )
     return None

@@ -72,11 +72,11 @@ METRICS: dict[str, Metric] = {
     "worst_cost": Metric("cost", "the cost farthest outside [0, 1]; null if all are within", "worst"),
     "lambda": Metric("", "the multiplier, with the gains of PID, mean over agents and costs; 0 without one"),
     "cost_excess": Metric(
-        "cost per step",
-        "how far the estimated episode cost is beyond the limit less `cost_margin`, of the agent and cost furthest "
-        "beyond",
+        "limits",
+        "how far the estimated episode cost is beyond the limit less `cost_margin`, as a share of that, of the agent "
+        "and cost furthest beyond",
     ),
-    "limit_lowered": Metric("cost per step", "by how much MACPO keeps below the limit less `cost_margin`, mean"),
+    "limit_lowered": Metric("limits", "by how much MACPO keeps below the limit less `cost_margin`, mean"),
     "critic/loss": Metric("", "clipped squared error in normalised units, in an update's last epoch", "loss"),
     "critic/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
     "critic/explained_variance": Metric("", "1 - variance of the critic's error / variance of the returns"),
@@ -91,7 +91,7 @@ METRICS: dict[str, Metric] = {
     "actor/share_of_step": Metric("", "share of an update's step that `kl_max` kept"),
     "actor/penalty": Metric("", "P3O's penalty before its weight, in an update's last epoch"),
     "actor/case": Metric("", "which case of the trust-region problem was solved"),
-    "actor/reach": Metric("cost per step", "most that a step of the trust region promises to take off the cost"),
+    "actor/reach": Metric("limits", "most that a step of the trust region promises to take off the cost"),
     "actor/line_search_steps": Metric("", "steps of the line search that were tried in vain"),
     "fear/loss": Metric("", "loss of the fear network, in an update's last epoch"),
     "fear/grad_norm": Metric("", "norm of the gradient before clipping, in an update's last epoch"),
@@ -107,7 +107,7 @@ METRICS: dict[str, Metric] = {
     "regret/weight_std": Metric("", "standard deviation of that weight"),
 }
 METRICS |= {
-    name.replace("critic/", "cost_critic/", 1): metric._replace(unit=metric.unit.replace("reward", "cost"))
+    name.replace("critic/", "cost_critic/", 1): metric._replace(unit=metric.unit.replace("reward", "limits"))
     for name, metric in METRICS.items()
     if name.startswith("critic/")
 }

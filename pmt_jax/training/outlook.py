@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import jax.numpy as jnp
-
 from ..config.methods import label
-from ..learning import constraint
+from ..config.settings import Config
 from ..learning.setup import Setup
 from ..limits import Limits
 
@@ -29,34 +27,25 @@ def notes(setup: Setup) -> list[str]:
             "reward will suffer; a small limit above 0 can be met from below"
         )
     steps, horizon = config.num_updates * config.rollout_length, setup.vector.horizon
-    if config.cost_estimate == "episode" and steps < horizon:
+    if steps < horizon:
         found.append(
             f"note: {config.num_envs} environments make {steps:,} steps each, less than the {horizon:,} of an episode, "
-            "so its cost is hardly ever measured; raise --steps or lower --num-envs"
+            "so its cost is hardly measured; raise --steps or lower --num-envs"
         )
     elif setup.method.constraint == "lagrangian" and min(given.each) > 0:
-        found += _of_multiplier(setup, given)
+        found += _of_multiplier(config, given)
     return found
 
 
-def _of_multiplier(setup: Setup, given: Limits) -> list[str]:
+def _of_multiplier(config: Config, given: Limits) -> list[str]:
     """Whether costs of twice the limit, in every update of the run, would move the multiplier."""
-    config, hyper = setup.config, setup.hyper
-    costs, horizon = jnp.asarray(given.each, jnp.float32), setup.vector.horizon
-    excess = constraint.cost_excess(2 * costs, constraint.target(hyper), horizon)
-    share = float(jnp.min(constraint.excess_in_lambda_unit(setup, hyper, excess)))
-    begin, rate, gain = config.lambda_init, config.lambda_lr, config.lambda_kp * share
-    if config.lambda_unit == "relative":
-        end = begin * math.exp(min(50.0, rate * share * config.num_updates))
-    else:
-        end = begin + rate * share * config.num_updates
-    if min(end, config.lambda_max) + gain >= LITTLE * max(begin, 0.1):
+    begin, rate = config.lambda_init, config.lambda_lr
+    end = min(begin * math.exp(min(50.0, rate)), config.lambda_max)
+    if end + config.lambda_kp >= LITTLE * begin:
         return []
     if config.lambda_max < LITTLE * begin:
         return [f"note: the multiplier begins at {begin:g} and may not exceed lambda_max = {config.lambda_max:g}"]
-    enough = (LITTLE * max(begin, 0.1)) / max(share * config.num_updates, 1e-30)
     return [
-        f"note: with costs of twice the limit of {given}, the multiplier would move from {begin:g} to {end:.3g} in all "
-        f"{config.num_updates:,} updates, too little to matter; raise --lambda-lr (now {rate:g}) to {enough:.2g} or "
-        "more, or train for more --steps"
+        f"note: with costs of twice the limit of {given}, the multiplier would move from {begin:g} to {end:.3g} in the "
+        f"whole run, too little to matter; raise --lambda-lr (now {rate:g}) to {math.log(LITTLE):.2g} or more"
     ]

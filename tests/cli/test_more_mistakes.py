@@ -87,15 +87,13 @@ train lane --actor-lr -inf | actor_lr must be a number that is not negative and 
 train lane --max-grad-norm 0 | max_grad_norm must be a number above 0, or inf, not 0.0
 train lane --gae-lambda 2 | gae_lambda must lie in [0, 1], not 2.0
 train lane --clip 0 | clip must be a number above 0, not 0.0
-train lane --value-norm-decay 1.1 | value_norm_decay must lie in [0, 1], not 1.1
 train lane --cost-limit 1,2 | cost_limit has 2 numbers, but task 'lane' has 1 cost(s)
 train lane --cost-limit 1e39 | cost_limit must be a cost per episode of at least 0 that fits 32 bits, not 1e+39
 train lane --cost-limit one | cost_limit = 'one' does not fit: expected a number, or one for each cost
 train lane --lambda-max 0.1 | lambda_init = 0.78 lies above lambda_max = 0.1
-train lane --cost-estimate critic --gamma 1 | set gamma below 1 or take another cost_estimate
 train lane --method macpo --limit-lr 3 | limit_lr must lie in [0, 1], not 3.0
 train lane --method macpo --kl-limit inf | kl_limit must be a number above 0, not inf
-train lane --lambda-unit relative --lambda-init 0 | with lambda_unit = relative a multiplier of 0 never moves
+train lane --lambda-init 0 | a multiplier of 0 never moves
 train lane --physics= | physics = '' does not fit: expected auto | fused | mjx
 train lane --env num_agents | env = ['num_agents'] does not fit: expected name=value
 train ant_2x4 --env physics=warp | 'physics' is no option of a task; set physics = ... (--physics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import pathlib
 import tomllib
 
@@ -52,15 +51,8 @@ def test_what_cannot_be_extended_gets_a_sentence(base: str, says: str, tmp_path:
 
 def test_a_preset_lies_over_the_file_and_under_the_flags(tmp_path: pathlib.Path):
     file = write(tmp_path, mine='extends = "lane"\nkappa = 2.0\n[method.f4sg]\nfear_time = "next"\n')
-    config = load_config(file, method="f4sg", preset="paper_letter", fear_loss="ce")
-    assert (config.kappa, config.fear_time, config.fear_loss) == (math.inf, "current", "ce")
-
-
-def test_numbers_that_stand_for_another_setting():
-    letter = load_config("lane", preset="paper_letter", rollout_length=50)
-    assert letter.surrogate_weight == 50.0 and letter.replace(clip=0.1).surrogate_weight == 50.0
-    assert load_config("lane", preset="reference", minibatches=4).trust_steps == 4
-    assert load_config("lane", trust_steps=0).trust_steps == load_config("lane").minibatches
+    config = load_config(file, method="f4sg", preset="reference", lambda_kp=0.25)
+    assert (config.kappa, config.fear_time, config.lambda_kp, config.limit_lr) == (2.0, "next", 0.25, 0.0)
 
 
 def test_the_command_lines_options_join_those_of_the_file():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import chex
 import jax
@@ -25,7 +24,7 @@ def holding(state: LearnerState, **changes: jax.Array) -> LearnerState:
 
 @pytest.mark.full
 def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
-    lagrangian, _ = trained("mappo_l", lambda_init=0.0, lambda_lr=0.0)
+    lagrangian, _ = trained("mappo_l", lambda_init=0.0, lambda_max=0.0)
     chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
 
 
@@ -88,7 +87,7 @@ def test_crpo_within_its_limit_is_happo():
 def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
     setup, _, batch = acted()
     setup = dataclasses.replace(setup, method=METHODS["crpo"])
-    reward, *cost = jax.random.normal(jax.random.key(2), (3, *batch.reward.shape))
+    reward, *cost = 10 * jax.random.normal(jax.random.key(2), (3, *batch.reward.shape))  # far from the floor
     none, chosen = jnp.zeros_like(batch.log_prob), jnp.asarray([[1.0], [0.0]])
     rows = policies.policy_samples(setup, setup.hyper, chosen, batch, reward, jnp.stack(cost, -1)[..., None], none)
     for advantage, expected in zip(rows.advantage, (-cost[0], reward), strict=True):
@@ -97,13 +96,13 @@ def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
 
 @pytest.mark.full
 def test_pid_pays_with_what_it_has_just_added_up_and_keeps_the_size_of_the_step():
-    gains = {"lambda_init": 0.5, "lambda_lr": 0.2, "lambda_kp": 0.5, "lambda_kd": 0.25}
+    gains = {"lambda_init": 0.5, "lambda_lr": 0.6, "lambda_kp": 0.5, "lambda_kd": 0.25}  # over three updates
     made = program("mappo_pid")
     state = made.init(made.hyper(**gains), jax.random.key(0))
     integral, previous = 0.5, 0.0
     for _ in range(3):
         state, metrics = made.step(made.hyper(**gains), state)
-        excess = float(metrics["cost_excess"])
+        excess = min(float(metrics["cost_excess"]), 1.0)
         integral = max(integral + 0.2 * excess, 0.0)
         price = integral + 0.5 * excess + 0.25 * max(excess - previous, 0.0)
         np.testing.assert_allclose(metrics["lambda"], price, rtol=1e-4)
@@ -118,26 +117,28 @@ def test_a_multiplier_that_acts_makes_a_difference():
 
 def test_pid_weighs_costs_by_three_terms():
     """A proportional gain weighs costs as a larger multiplier does, from the first update on."""
-    plain = program("mappo_l")
-    start = plain.init(plain.setup.hyper, jax.random.key(0))
-    _, metrics = plain.step(plain.setup.hyper, start)
+    plain, limit = program("mappo_l"), {"cost_limit": 8.0}
+    without = plain.hyper(lambda_kp=0.0, **limit)
+    start = plain.init(without, jax.random.key(0))
+    _, metrics = plain.step(without, start)
     excess = metrics["cost_excess"]  # the same of both agents; the estimate before the first update is the limit
-    with_gains, shown = plain.step(plain.hyper(lambda_kp=0.5, lambda_kd=0.25), start)
-    larger, _ = plain.step(plain.setup.hyper, holding(start, multiplier=start.constraint.multiplier + 0.75 * excess))
+    assert 0 < excess < 1
+    with_gains, shown = plain.step(plain.hyper(lambda_kp=0.5, lambda_kd=0.25, **limit), start)
+    larger, _ = plain.step(without, holding(start, multiplier=start.constraint.multiplier + 0.75 * excess))
     chex.assert_trees_all_close(with_gains.actor.params, larger.actor.params, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(shown["lambda"], with_gains.constraint.multiplier.mean() + 0.75 * excess, rtol=1e-5)
-    _, later = plain.step(plain.hyper(lambda_kd=0.25), with_gains)
+    _, later = plain.step(plain.hyper(lambda_kp=0.0, lambda_kd=0.25, **limit), with_gains)
     rise = max(float(later["cost_excess"] - excess), 0.0)
     np.testing.assert_allclose(
-        later["lambda"], plain.step(plain.hyper(), with_gains)[0].constraint.multiplier.mean() + 0.25 * rise, rtol=1e-2
+        later["lambda"], plain.step(without, with_gains)[0].constraint.multiplier.mean() + 0.25 * rise, rtol=1e-2
     )
 
 
 @pytest.mark.parametrize("method", ["mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
 def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
     """Also by an estimate that remembers what it began with: no excess."""
-    kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5, cost_estimate="average")
-    lower, others = trained(method, cost_limit=1.0, cost_estimate="average")
+    kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5)
+    lower, others = trained(method, cost_limit=1.0)
     chex.assert_trees_all_equal(weights(kept)["actor"], weights(lower)["actor"])
     assert shown["cost_excess"] == others["cost_excess"]
     assert shown["episode_cost_beyond"] < others["episode_cost_beyond"]
@@ -146,59 +147,23 @@ def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
 @pytest.mark.full
 def test_macpo_keeps_to_the_limit_that_it_lowered():
     made = program("macpo")
-    horizon, start = made.setup.vector.horizon, made.init(made.setup.hyper, jax.random.key(0))
-    lowered = holding(start, lowered=jnp.full_like(start.constraint.lowered, 2.0 / horizon))
+    start = made.init(made.setup.hyper, jax.random.key(0))
+    lowered = holding(start, lowered=jnp.full_like(start.constraint.lowered, 2 / 12))
     after, metrics = made.step(made.hyper(cost_limit=12.0, limit_lr=0.25), lowered)
     lower, _ = made.step(made.hyper(cost_limit=10.0), start)
     chex.assert_trees_all_close(after.actor.params, lower.actor.params, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(after.constraint.lowered, 2.0 / horizon + 0.25 * metrics["cost_excess"], rtol=1e-5)
+    np.testing.assert_allclose(after.constraint.lowered, 2 / 12 + 0.25 * metrics["cost_excess"], rtol=1e-5)
 
 
 @pytest.mark.full
-def test_macpo_lowers_its_limit_by_no_more_than_limit_windup_allows():
-    made = program("macpo")
-    start = made.init(made.setup.hyper, jax.random.key(0))
-    # After two half-lives of the trust region a step reaches half as far as the first did.
-    far = holding(dataclasses.replace(start, update=jnp.int32(2)), lowered=jnp.ones_like(start.constraint.lowered))
-    for windup, counted in (1.0, 1.0), (1.5, 1.5), (math.inf, 2.0):
-        hyper = made.hyper(limit_lr=1.0, limit_windup=windup, kl_half_life=made.setup.config.batch_size)
-        after, metrics = made.step(hyper, far)  # all the way: a limit_lr of 1
-        np.testing.assert_allclose(after.constraint.lowered.mean(), counted * metrics["actor/reach"], rtol=1e-5)
-
-
-@pytest.mark.full
-def test_macpos_steps_halve_in_actor_lr_half_life():
-    made = program("macpo")
-    start = made.init(made.setup.hyper, jax.random.key(0))
-    shorter = made.hyper(actor_lr_half_life=made.setup.config.batch_size)
-    first, _ = made.step(shorter, start)
-    chex.assert_trees_all_equal(first, made.step(made.setup.hyper, start)[0])
-    second, _ = made.step(shorter, first)
-    quarter = made.hyper(kl_limit=made.setup.hyper.kl_limit / 4)  # a step's divergence is the square of its length
-    chex.assert_trees_all_equal(second, made.step(quarter, first)[0])
-    assert differ(second.actor, made.step(made.setup.hyper, first)[0].actor)
-
-
-@pytest.mark.full
-def test_a_multiplier_in_units_of_the_limit_climbs_alike_below_every_limit():
-    made = program("mappo_l", lambda_unit="limit")
-    for limit in 1.0, 0.125:  # costs are more than twice as high at first
-        after, _ = made.step(
-            made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
-            made.init(made.setup.hyper, jax.random.key(0)),
-        )
-        np.testing.assert_allclose(after.constraint.multiplier, 0.78 + 0.25, rtol=1e-6)
-
-
-@pytest.mark.full
-def test_a_relative_multiplier_grows_by_the_same_share_below_every_limit():
-    made = program("mappo_l", lambda_unit="relative")
+def test_a_multiplier_grows_by_the_same_share_below_every_limit():
+    made = program("mappo_l")
     for limit in 1.0, 0.125:
         after, _ = made.step(
-            made.hyper(cost_limit=limit, surrogate_weight=0.0, lambda_lr=0.25),
+            made.hyper(cost_limit=limit, lambda_lr=0.75),
             made.init(made.setup.hyper, jax.random.key(0)),
         )
-        np.testing.assert_allclose(after.constraint.multiplier, 0.78 * np.exp(0.25), rtol=1e-6)
+        np.testing.assert_allclose(after.constraint.multiplier, 0.78 * np.exp(0.75 / 3), rtol=1e-6)
 
 
 @pytest.mark.full
@@ -216,7 +181,7 @@ def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without:
 
 
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(fear, "appraise_fear", lambda setup, hyper, now, net, batch, key: (net, batch.cost, {}))
+    monkeypatch.setattr(fear, "appraise_fear", lambda *given: (given[3], given[4].cost, {}))
     made = program.__wrapped__("f4sg")
     state = made.init(made.setup.hyper, jax.random.key(0))
     for _ in range(3):

@@ -84,10 +84,10 @@ def test_uncoupled_entries_are_solved_exactly_however_small_their_curvature():
 
 def test_line_search_takes_the_first_that_is_accepted():
     start, step = jnp.zeros(1), jnp.ones(1)
-    point, tried = backtrack(lambda x: x[0] <= 0.5, start, step, 1.0, 0.8)
+    point, tried = backtrack(lambda x: x[0] <= 0.5, start, step)
     np.testing.assert_allclose(point, 0.8**4, rtol=1e-6)
     assert tried == 4
-    point, tried = backtrack(lambda x: x[0] < 0, start, step, 1.0, 0.8)
+    point, tried = backtrack(lambda x: x[0] < 0, start, step)
     assert point == 0 and tried == 10
 
 

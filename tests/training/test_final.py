@@ -169,29 +169,30 @@ LANE = dict(num_envs=4, rollout_length=25, hidden=(8,), minibatches=1)
         ("happo", {"cost_limit": 1.0}, "happo has no constraint"),
         ("f4sg", {"cost_limit": 0.0}, "no cost is below a limit of 0"),
         ("macpo", {"cost_limit": 0.0}, "no cost is below a limit of 0"),
-        ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 1e-6}, "raise --lambda-lr"),
-        ("mappo_l", {"cost_limit": 1.0, "steps": 400}, "too little to matter"),
-        ("mappo_l", {"cost_limit": 1.0, "lambda_unit": "relative", "lambda_lr": 1e-4}, "raise --lambda-lr"),
-        ("r4sg", {"cost_limit": 1.0, "rollout_length": 5, "steps": 80, "num_envs": 4}, "is hardly ever measured"),
-        ("mappo_l", {"cost_limit": 1.0, "lambda_init": 2.0, "lambda_max": 2.0, "lambda_lr": 1.0}, "may not exceed"),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 1e-6, "lambda_kp": 0.0}, "raise --lambda-lr"),
+        ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 0.01, "lambda_kp": 0.0}, "too little to matter"),
+        ("r4sg", {"cost_limit": 1.0, "rollout_length": 5, "steps": 80, "num_envs": 4}, "is hardly measured"),
+        (
+            "mappo_l",
+            {"cost_limit": 1.0, "lambda_init": 2.0, "lambda_max": 2.0, "lambda_lr": 1.0, "lambda_kp": 0.0},
+            "may not exceed",
+        ),
         ("mappo", {}, None),
         ("mappo_l", {"lambda_lr": 1e-6}, None),  # nobody asked for this limit
         ("mappo_l", {"cost_limit": 1.0, "lambda_lr": 1.0, "steps": 100_000}, None),
-        ("mappo_l", {"cost_limit": 1.0, "lambda_unit": "relative", "lambda_lr": 0.1, "steps": 100_000}, None),
+        ("mappo_l", {"cost_limit": 1.0}, None),
         ("macpo", {"cost_limit": 1.0}, None),
     ],
 )
 def test_a_limit_that_the_settings_cannot_reach_is_named_at_the_start(method: str, settings: dict, said: str | None):
-    config = load_config("lane", method=method, **(LANE | {"cost_estimate": "episode"} | settings))
+    config = load_config("lane", method=method, **(LANE | settings))
     notes = outlook.notes(make_setup(config))
     assert (notes == []) if said is None else any(said in note for note in notes), notes
 
 
 def test_the_rate_that_is_advised_is_enough():
     """What the sentence says to set, set: nothing is left to say."""
-    config = load_config(
-        "lane", method="mappo_l", cost_limit=1.0, lambda_unit="step", lambda_lr=1e-4, steps=10_000, **LANE
-    )
+    config = load_config("lane", method="mappo_l", cost_limit=1.0, lambda_lr=1e-4, lambda_kp=0.0, steps=10_000, **LANE)
     (note,) = outlook.notes(make_setup(config))
     enough = float(note.rpartition(" to ")[2].split()[0])
     assert outlook.notes(make_setup(config.replace(lambda_lr=1.1 * enough))) == []

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from .pytree import pytree
 
 MIN_WEIGHT = 1e-5
+RETURNS_DECAY = 0.995  # share of the moments of returns that survives an update
 MIN_RETURN_VARIANCE = 1e-2
 MIN_OBS_VARIANCE = 1e-8
 OBS_CLIP = 10.0
