@@ -12,14 +12,14 @@ import jax.numpy as jnp
 from .. import tasks
 from ..config.settings import Config, Hyper
 from ..errors import UsageError
-from . import constraint, critics, fear, regret, rollout, schedules, sharding
+from . import constraint, critics, fear, letter, regret, rollout, schedules, sharding
 from .debug import check_finite, watched
 from .maths import running_moments
 from .maths.advantages import gae
 from .optimise import init_train_state
 from .policies import Team, policy_samples, update_policies
 from .setup import Setup, make_setup
-from .types import Batch, Critic, LearnerState, Metrics, Tag
+from .types import Batch, Critic, LearnerState, Metrics, Tag, TrainState
 
 Train = Callable[..., tuple[LearnerState, Metrics]]
 
@@ -93,9 +93,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         cost_critic=Critic(
             init_train_state(setup.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), running_moments.init(heads)
         ),
-        fear=init_train_state(setup.nets.init_fear(tagged[Tag.FEAR], hyper.fear_start))
-        if setup.method.cost_signal == "fear"
-        else None,
+        fear=_init_fear(setup, hyper, tagged[Tag.FEAR]) if setup.method.cost_signal == "fear" else None,
         regret=(
             jax.vmap(init_train_state)(setup.nets.init_regret(tagged[Tag.REGRET]))
             if setup.method.ratio_weight == "regret"
@@ -110,6 +108,12 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
     )
 
 
+def _init_fear(setup: Setup, hyper: Hyper, key: jax.Array) -> TrainState:
+    if setup.method.letter:
+        return letter.init_fear(setup, hyper, key)
+    return init_train_state(setup.nets.init_fear(key, hyper.fear_start))
+
+
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
     setup = dataclasses.replace(setup, nets=setup.nets.fast)
@@ -121,9 +125,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
+    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
     (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
-        partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
-        partial(regret.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
+        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
+        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
     )
 
     # 3 Advantages of reward and of danger.

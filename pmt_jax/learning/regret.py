@@ -105,7 +105,16 @@ def regret_weight(
       [...]; a constant of the policy's weights.
     """
     new, old = jnp.minimum(new, regret_max) * mask, jnp.minimum(old, regret_max) * mask
-    above = jnp.sum((new[..., None, :] > new[..., :, None]) * mask[..., None, :], axis=-1)
-    chosen = above < jnp.ceil(omega * mask.sum(-1, keepdims=True))
+    chosen = most_regretted(new, mask, omega)
     log_weight = jnp.sum(chosen * (jnp.log1p(-new) - jnp.log1p(-old)), axis=-1)
     return jnp.clip(log_weight, jnp.log(jnp.maximum(1 - bound, 0.0)), jnp.log1p(bound))
+
+
+def most_regretted(regret: jax.Array, mask: jax.Array, omega: jax.Array | float) -> jax.Array:
+    """Which action entries count, [..., A] bool: the ceil(omega A) with the most regret (ties all count).
+
+    Args:
+      regret: [..., A], 0 where mask [..., A] is.
+    """
+    above = jnp.sum((regret[..., None, :] > regret[..., :, None]) * mask[..., None, :], axis=-1)
+    return above < jnp.ceil(omega * mask.sum(-1, keepdims=True))
