@@ -51,13 +51,13 @@ def test_what_cannot_be_extended_gets_a_sentence(base: str, says: str, tmp_path:
 
 
 def test_a_preset_lies_over_the_file_and_under_the_flags(tmp_path: pathlib.Path):
-    file = write(tmp_path, mine='extends = "lane"\nkappa = 2.0\n[method.f4sg]\nfear_time = "next"\n')
-    config = load_config(file, method="f4sg", preset="paper_letter", fear_loss="ce")
-    assert (config.kappa, config.fear_time, config.fear_loss) == (math.inf, "current", "ce")
+    file = write(tmp_path, mine='extends = "lane"\ngae_lambda = 0.5\n[method.f4sg]\nfear_time = "next"\n')
+    config = load_config(file, method="f4sg", preset="letter", fear_loss="ce")
+    assert (config.gae_lambda, config.fear_time, config.fear_loss) == (1.0, "current", "ce")
 
 
 def test_numbers_that_stand_for_another_setting():
-    letter = load_config("lane", preset="paper_letter", rollout_length=50)
+    letter = load_config("lane", preset="letter", rollout_length=50)
     assert letter.surrogate_weight == 50.0 and letter.replace(clip=0.1).surrogate_weight == 50.0
     assert load_config("lane", preset="reference", minibatches=4).trust_steps == 4
     assert load_config("lane", trust_steps=0).trust_steps == load_config("lane").minibatches

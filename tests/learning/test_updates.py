@@ -440,9 +440,9 @@ def hyper_of(setup: Setup, limits: float | list[float], **changes: float) -> Hyp
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("preset", ["paper_letter", "reference"])
+@pytest.mark.parametrize("preset", ["letter", "reference"])
 @pytest.mark.parametrize("method", ["mixed", "macpo"])
-def test_the_letter_of_the_paper_runs(method: str, preset: str):
+def test_presets_for_comparison_run(method: str, preset: str):
     state, metrics = jax.jit(make_train(load_config("lane", method=method, preset=preset, **SMALL)))(jax.random.key(0))
     for x in jax.tree.leaves((weights(state), metrics["actor/loss"])):
         assert np.isfinite(x).all()
