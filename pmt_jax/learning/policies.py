@@ -83,7 +83,7 @@ def policy_samples(
         cost_advantage=centred,
         log_weight=log_weight[..., -1] if moves else log_weight,
         factor=jnp.ones_like(batch.log_prob),
-        paid=each - hybrid if letter else None,
+        paid=jnp.sum(cost_weight * scaled, axis=-1) if letter else None,
         moving_log_weight=log_weight[..., :-1] if moves else None,
     )
     return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), samples)
