@@ -113,13 +113,7 @@ def appraise_regret(
     """
     if net is None:
         return regret.appraise_regret(setup, hyper, now, net, batch, key)
-    mask = jnp.asarray(setup.vector.spec.action_mask)
-    state = jnp.broadcast_to(batch.state[:, :, None], (*batch.log_prob.shape, batch.state.shape[-1]))
-    before = jax.vmap(setup.nets.regret, (0, 2, 2), 2)(net.params, state, batch.action)
-    density = regret.deliberateness((batch.action - batch.mean) / batch.std)
-    costly = (batch.cost.max(-1, keepdims=True) > 0) * mask
-    samples: Any = (state, batch.action, density, jax.nn.sigmoid(before), costly)
-    samples = jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), samples)
+    mask, before, costly, samples = regret.samples_of_agents(setup, net, batch, lambda density: density)
 
     def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, action, target, old, weight = samples
@@ -144,15 +138,9 @@ def appraise_regret(
     after = jnp.moveaxis(after, (1, 2, 0), (0, 1, 2)).reshape(-1, *before.shape)  # [epochs, T, B, N, A]
     moving = log_weight(after, before, batch.cost, mask, hyper.omega)
     whole = log_weight(after[-1], before, batch.cost, mask, jnp.inf)
-    weight = jnp.exp(moving[-1])
-    diagnostics = {
-        "on_costly": (regret.regret(after[-1], batch.cost) * mask).sum() / costly.sum(),
-        "on_safe": (jax.nn.sigmoid(after[-1]) * (mask - costly)).sum() / (mask - costly).sum(),
-        "weight_mean": weight.mean(),
-        "weight_std": weight.std(),
-    }
+    shown = regret.diagnostics(after[-1], regret.regret(after[-1], batch.cost), mask, costly, jnp.exp(moving[-1]))
     weights = jnp.moveaxis(jnp.concatenate([moving, whole[None]]), 0, -1)
-    return learned, weights, {**{k: x[:, -1].mean(0) for k, x in metrics.items()}, **diagnostics}
+    return learned, weights, {**{k: x[:, -1].mean(0) for k, x in metrics.items()}, **shown}
 
 
 def log_weight(new: jax.Array, old: jax.Array, cost: jax.Array, mask: jax.Array, omega: jax.Array | float) -> jax.Array:

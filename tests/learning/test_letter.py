@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pmt_jax import METHODS, Method, UsageError, load_config, make_setup, make_train
+from pmt_jax import METHODS, Method, load_config, make_setup, make_train
+from pmt_jax.errors import UsageError
 from pmt_jax.learning import critics, learner, letter, policies, schedules
 from pmt_jax.learning.maths import losses
 from pmt_jax.learning.maths.advantages import gae

@@ -81,14 +81,13 @@ def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("ours", ["f4sg", "f4sg_letter"])
 def test_a_fear_network_of_each_agent_goes_to_no_other_team(ours: str, monkeypatch: pytest.MonkeyPatch):
-    theirs = make_setup(load_config("lane", "f4sg_letter", num_envs=4, rollout_length=25, env=(("num_agents", 3),)))
-    learned = jax.eval_shape(jax.vmap(functools.partial(learner.init, theirs), (None, 0)), *theirs.vmap_arguments[:2])
+    theirs, learned = first(method="f4sg_letter", env=(("num_agents", 3),))
     monkeypatch.setattr(warm_start, "load_run", lambda folder: (theirs, learned))
-    config = load_config("lane", ours, num_envs=4, rollout_length=25, init_fear="other")
+    setup, _ = first(method=ours, init_fear="other")
     with pytest.raises(
         UsageError, match="other has a fear network for each of its 3 agents; init_fear needs a run of 2"
     ):
-        warm_start.prepare(make_setup(config))
+        warm_start.prepare(setup)
 
 
 def test_a_pretrained_policy_brings_what_acts():
