@@ -109,9 +109,19 @@ def as_switches(_: str) -> str:
     for name, method in METHODS.items():
         order = f"{method.order}, {'one shared actor' if method.share_actor else 'an actor each'}"
         cost = "-" if method.constraint == "none" else str(method.cost_signal)
-        rest = [method.ratio_weight, method.surrogate.replace("_", " "), method.critic]
+        printed = "yes" if method.letter else "-"
+        rest = [method.ratio_weight, method.surrogate.replace("_", " "), method.critic, printed]
         body.append([f"`{name}`", order, method.constraint.replace("_", " "), cost, *rest])
-    columns = ("method", "update", "constraint", "cost signal", "ratio weight", "surrogate", "critics see")
+    columns = (
+        "method",
+        "update",
+        "constraint",
+        "cost signal",
+        "ratio weight",
+        "surrogate",
+        "critics see",
+        "as printed",
+    )
     return markdown(columns, body)
 
 

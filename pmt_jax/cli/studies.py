@@ -28,7 +28,7 @@ def _add_sweep(commands: Any) -> None:
         commands,
         "sweep",
         run_sweep,
-        "train many settings side by side: pmt sweep ant_2x4 --set lambda_lr=0.03,0.1,0.3 --set fear_l2=0,1",
+        "train many settings side by side: pmt sweep ant_2x4 --set lambda_lr=1,2,4 --set emotion_l2=0,1",
         usage="pmt sweep TASK|CONFIG --set NAME=VALUE,... [--set ...] --out DIR [--SETTING VALUE ...]",
         description="Trains every combination of the --set values; the same command continues an interrupted sweep.",
         add_help=False,

@@ -45,6 +45,8 @@ class Method:
       share_actor: one actor for all agents (needs equal action spaces and agent ids in the observation).
       surrogate: what the epochs maximise: PPO's `clipped` surrogate, or FOCOPS's `first_order` one.
       critic: what the critics see: the global `state`, or each agent's own `observation` (needs agent ids in it).
+      letter: fear and regret, the advantages and the critics' loss are as the paper prints them, where the working form
+        differs (docs/methods/f4sg.md, r4sg.md); `--preset letter` has the paper's settings.
     """
 
     order: Order
@@ -54,6 +56,7 @@ class Method:
     share_actor: bool = False
     surrogate: Literal["clipped", "first_order"] = "clipped"
     critic: Literal["state", "observation"] = "state"
+    letter: bool = False
 
     def __post_init__(self) -> None:
         """Refuses what no row can have.
@@ -67,6 +70,8 @@ class Method:
                 raise UsageError(f"a method's {name} must be {' or '.join(words)}, not {getattr(self, name)!r}")
         if self.cost_signal not in ("cost", "fear") and not callable(self.cost_signal):
             raise UsageError(f"a method's cost_signal must be cost, fear or a function, not {self.cost_signal!r}")
+        if self.letter and (self.order, self.constraint, self.surrogate) != ("sequential", "lagrangian", "clipped"):
+            raise UsageError("a method's letter needs order sequential, constraint lagrangian and surrogate clipped")
 
 
 METHODS: dict[str, Method] = {
@@ -83,6 +88,8 @@ METHODS: dict[str, Method] = {
     "crpo": Method(order="sequential", constraint="switching"),
     "p3o": Method(order="sequential", constraint="penalty"),
     "focops": Method(order="sequential", constraint="lagrangian", surrogate="first_order"),
+    "f4sg_letter": Method(order="sequential", constraint="lagrangian", cost_signal="fear", letter=True),
+    "r4sg_letter": Method(order="sequential", constraint="lagrangian", ratio_weight="regret", letter=True),
 }
 
 

@@ -80,7 +80,7 @@ class Hyper:
         Bound("be a cost per episode of at least 0 that fits 32 bits", lambda x: _is_limit(x)),
     )
     cost_margin: float = constraint(
-        0.0,
+        0.2,
         "safety margin, a share of the limit: the learner holds costs to (1 - cost_margin) * cost_limit; tables use "
         "cost_limit",
         Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
@@ -90,9 +90,9 @@ class Hyper:
         "probability that the learner notices the cost of a costly step; it scales the task's own limit, too",
         Bound("be a probability above 0", lambda x: 0 < x <= 1),
     )
-    lambda_init: float = constraint(0.78, "multiplier before the first update", NOT_NEGATIVE)
+    lambda_init: float = constraint(2.0, "multiplier before the first update", NOT_NEGATIVE)
     lambda_lr: float = constraint(
-        4.0,
+        1.0,
         "how far costs of twice the limit in every update of the run move the multiplier: the logarithm of what it is "
         "multiplied by, and for mappo_pid what is added to it",
         NOT_NEGATIVE,
@@ -112,32 +112,13 @@ class Hyper:
         0.0, "weight of the mean of ratio * cost advantage in the multiplier's step (Eq. 16)", NOT_NEGATIVE
     )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
-    fear_lr_start: float = emotion(
-        1e-2,
-        "learning rate of the fear network in the first update, if above emotion_lr; in update t it is this over t, "
-        "until it reaches emotion_lr",
-        NOT_NEGATIVE,
+    emotion_l2: float = emotion(
+        1.0, "weight of the squared change of fear and regret since collection (their cognitive error)", NOT_NEGATIVE
     )
-    fear_start: float = emotion(
-        math.nan,
-        "fear before any experience, as a logit: -4 is a probability of 0.018; nan takes the cost rate of the first "
-        "batch",
-        Bound("be a logit between -20 and 20, or nan", lambda x: math.isnan(x) or -20 <= x <= 20),
-    )
-    fear_l2: float = emotion(
-        1.0, "weight of fear's squared change since collection (its cognitive error)", NOT_NEGATIVE
-    )
-    regret_l2: float = emotion(1.0, "weight of regret's squared change since collection", NOT_NEGATIVE)
-    temperature: float = emotion(0.5, "temperature of the relaxed samples of the gumbel fear losses", POSITIVE)
     omega: float = emotion(
         0.5,
         "share of an action's entries that count, those with the most regret",
         NOT_NEGATIVE_OR_INF,
-    )
-    regret_max: float = emotion(
-        0.9,
-        "upper bound of regret; with regret_response = advantage the weight is at most 1 / (1 - regret_max)",
-        Bound("lie in [0, 1)", lambda x: 0 <= x < 1),
     )
     kappa: float = emotion(
         0.5, "the weight on the ratio stays within 1 +- kappa * clip; inf for no bound", NOT_NEGATIVE_OR_INF
@@ -194,14 +175,6 @@ class Config(Hyper):
     fear_time: Literal["next", "current"] = emotion(
         "next", "fear of the state to which an action leads, or of the state in which it is taken"
     )
-    fear_loss: Literal["ce", "gumbel_fwd", "gumbel_rev"] = emotion(
-        "ce", "cross entropy, or relaxed samples with the divergence from the observed cost forward or reversed"
-    )
-    regret_response: Literal["letter", "one_sided", "advantage"] = emotion(
-        "letter",
-        "letter: the change of regret weights the ratio, as in the paper; one_sided: regret itself weakens updates "
-        "that repeat the action and strengthens those that avoid it; advantage: regret weights the cost advantage",
-    )
     init_fear: str = emotion(
         "", "run folder whose fear network is the start, as a prior; agents of another team start with its mean"
     )
@@ -219,8 +192,6 @@ class Config(Hyper):
     eval_episodes: int = output(32, "episodes per seed of an evaluation during training", COUNT)
 
     def __post_init__(self) -> None:
-        if math.isnan(self.fear_start):  # always the same nan, so that equal settings compare equal
-            object.__setattr__(self, "fear_start", math.nan)
         _validate(self)
 
     @property

@@ -24,7 +24,7 @@ def init(setup: Setup, hyper: Hyper) -> Constraint:
     """The constraint before the first update: the estimate is the target, so that there is no excess yet."""
     heads = (setup.vector.spec.num_agents, setup.vector.spec.num_costs)
     return Constraint(
-        estimate=jnp.full(heads, goal(hyper)),
+        estimate=jnp.full(heads, goal(setup, hyper)),
         multiplier=jnp.full(heads, hyper.lambda_init * (setup.method.constraint in ("lagrangian", "pid"))),
         lowered=jnp.zeros(heads),
     )
@@ -39,41 +39,47 @@ def target(hyper: Hyper) -> jax.Array:
     return limit_less_margin(hyper, hyper.cost_margin)
 
 
-def in_limits(hyper: Hyper, cost: jax.Array, horizon: int) -> jax.Array:
+def in_unit(setup: Setup, hyper: Hyper, cost: jax.Array) -> jax.Array:
     """Costs of steps [..., K], or fear of them, in units of the limit: c L / d; their mean over an episode is J / d.
 
     The learner sees costs in this unit alone, so no other setting depends on the limit, on the horizon L or on how
-    often costs are noticed. A limit of 0 is no unit; costs are then counted as if one were allowed.
+    often costs are noticed. A limit of 0 is no unit; costs are then counted as if one were allowed. The letter has no
+    unit.
     """
+    if setup.method.letter:
+        return cost
     limit = target(hyper)
-    return cost * (horizon / jnp.where(limit > 0, limit, 1.0))
+    return cost * (setup.vector.horizon / jnp.where(limit > 0, limit, 1.0))
 
 
-def goal(hyper: Hyper) -> jax.Array:
-    """What the learner holds an episode's cost to in units of the limit, [] or [K]: 1, or 0 for a limit of 0."""
-    return (target(hyper) > 0).astype(jnp.float32)
+def goal(setup: Setup, hyper: Hyper) -> jax.Array:
+    """What a step's cost is held to in its unit, [] or [K]: 1, or 0 for a limit of 0; by the letter d / L."""
+    limit = target(hyper)
+    return limit / setup.vector.horizon if setup.method.letter else (limit > 0).astype(jnp.float32)
 
 
-def estimate_cost(hyper: Hyper, batch: Batch, previous: jax.Array, horizon: int) -> jax.Array:
-    """The undiscounted cost of an episode that the constraint is held against, in units of the limit [N, K].
+def estimate_cost(setup: Setup, hyper: Hyper, batch: Batch, previous: jax.Array, cost_value: jax.Array) -> jax.Array:
+    """The mean cost of a step, in its unit, that the constraint is held against [N, K].
 
-    A moving average of the mean cost per step, in which a batch has the weight of its share of an episode's time. It
-    needs no episode that ends, and no batch that sees all parts of one. Where few batches have costs, an excess that
-    is cut would be lower on average without it.
+    It is a moving average in which a batch has the weight of its share of an episode's time. It needs no episode that
+    ends, and no batch that sees all parts of one. Where few batches have costs, an excess that is cut would be lower on
+    average without it. By the letter it is (1 - gamma) times the mean value, as in the excess of the paper.
 
     Args:
-      previous: [N, K], the estimate before; horizon: in steps.
+      previous: [N, K], the estimate before; cost_value: [T, B, N, K] of the batch's states.
     """
-    rate = in_limits(hyper, batch.cost, horizon).mean((0, 1))
-    return previous + min(1.0, batch.cost.shape[0] / horizon) * (rate - previous)
+    if setup.method.letter:
+        return (1 - hyper.gamma) * cost_value.mean((0, 1))
+    rate = in_unit(setup, hyper, batch.cost).mean((0, 1))
+    return previous + min(1.0, batch.cost.shape[0] / setup.vector.horizon) * (rate - previous)
 
 
-def cost_excess(hyper: Hyper, estimate: jax.Array) -> jax.Array:
-    """How far costs [..., K] in units of the limit are beyond it: S = (J - d) / d; positive is too dangerous (Eq. 11).
+def cost_excess(setup: Setup, hyper: Hyper, estimate: jax.Array) -> jax.Array:
+    """How far a cost [..., K] in its unit is beyond the limit: S = (J - d) / d (Eq. 11).
 
     The paper's is a cost per step, (J - d) / L. As a share of the limit an equal excess is as serious at every limit.
     """
-    return estimate - goal(hyper)
+    return estimate - goal(setup, hyper)
 
 
 def cut(excess: jax.Array) -> jax.Array:
@@ -96,7 +102,12 @@ def price(setup: Setup, hyper: Hyper, multiplier: jax.Array, excess: jax.Array, 
     if setup.method.constraint not in ("lagrangian", "pid"):
         return multiplier
     return pid(
-        multiplier, cut(excess), cut(cost_excess(hyper, estimate)), hyper.lambda_kp, hyper.lambda_kd, hyper.lambda_max
+        multiplier,
+        cut(excess),
+        cut(cost_excess(setup, hyper, estimate)),
+        hyper.lambda_kp,
+        hyper.lambda_kd,
+        hyper.lambda_max,
     )
 
 
@@ -178,6 +189,10 @@ def respond(
     if setup.method.constraint != "lagrangian":
         return constraint
     surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
+    if setup.method.letter:
+        step = excess + hyper.surrogate_weight * setup.config.rollout_length * surrogate
+        updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
+        return dataclasses.replace(constraint, multiplier=updated)
     step, lowest = cut(excess + hyper.surrogate_weight * surrogate), LAMBDA_MIN * hyper.lambda_init
     updated = relative_update(constraint.multiplier, step, gain(setup, hyper), lowest, hyper.lambda_max)
     return dataclasses.replace(constraint, multiplier=updated)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from .maths import running_moments
-from .maths.losses import value_loss
+from .maths.losses import huber, value_loss
 from .optimise import Loss, fit
 from .rollout import flatten_steps
 from .schedules import Schedule
@@ -46,28 +46,32 @@ def fit_critic(
 ) -> tuple[Critic, Metrics]:
     """Updates the moments of the returns once, then fits the critic to them in the new units.
 
+    By the letter there are no moments, and errors are squared.
+
     Args:
       clip: half-width of the interval of values, in those units.
       samples: what the critic sees, states [T, B, S] or observations [T, B, N, O]; values when they were collected and
         returns, both [T, B, ...] in the signal's unit.
     """
     state, old_value, returns = samples
-    moments = running_moments.update_ema(critic.returns, returns, running_moments.RETURNS_DECAY)
+    letter, moments = setup.method.letter, critic.returns
+    if not letter:
+        moments = running_moments.update_ema(moments, returns, running_moments.RETURNS_DECAY)
     normalised = (state, running_moments.normalise(moments, old_value), running_moments.normalise(moments, returns))
 
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.critic_lr, "max_grad_norm": hyper.max_grad_norm}
-    loss = loss_of(value_fn, clip)
+    loss = loss_of(value_fn, clip, jnp.square if letter else huber)
     net, metrics = fit(critic.net, loss, jax.tree.map(flatten_steps, normalised), key, **limits, **passes)
     unexplained = jnp.var(returns - old_value) / jnp.maximum(jnp.var(returns), 1e-8)
     return Critic(net, moments), {**metrics, "explained_variance": 1 - unexplained}
 
 
-def loss_of(value_fn: ValueFn, clip: jax.Array | float) -> Loss:
+def loss_of(value_fn: ValueFn, clip: jax.Array | float, penalty: Callable[[jax.Array], jax.Array] = huber) -> Loss:
     """The mean of `value_loss` over rows of states, old values and targets, these in normalised units."""
 
     def loss(params: Params, minibatch: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         state, old, target = minibatch
-        return value_loss(value_fn(params, state), old, target, clip).mean(), {}
+        return value_loss(value_fn(params, state), old, target, clip, penalty).mean(), {}
 
     return loss

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from .maths.losses import appraisal_loss, bernoulli_kl, cross_entropy, smoothed
+from .maths.losses import appraisal_loss, cross_entropy
 from .optimise import fit
 from .rollout import flatten_steps
 from .schedules import Schedule
@@ -16,8 +15,6 @@ from .setup import Setup
 from .types import Batch, Hyper, Metrics, Params, TrainState
 
 BINS = 10
-
-FearLoss = Literal["ce", "gumbel_fwd", "gumbel_rev"]
 
 
 def appraise_fear(
@@ -45,46 +42,18 @@ def appraise_fear(
     net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, share.mean((0, 1))))
     remembered = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     samples = jax.tree.map(flatten_steps, (seen, share, remembered))
-    noise = jax.random.logistic(jax.random.fold_in(key, 2), samples[1].shape)
 
     def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
-        state, cost, old, noise = samples
+        state, cost, old = samples
         logits = setup.nets.fear(params, state)
-        distance = divergence(logits, cost, setup.config.fear_loss, noise, hyper.temperature)
-        return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.fear_l2), {}
+        distance = cross_entropy(logits, cost)  # Eq. 3 forward: its minimiser is the probability itself
+        return appraisal_loss(distance, logits, old, jnp.ones_like(cost), hyper.emotion_l2), {}
 
     passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.fear_lr, "max_grad_norm": hyper.max_grad_norm}
-    net, metrics = fit(net, loss, (*samples, noise), key, **limits, **passes)
+    net, metrics = fit(net, loss, samples, key, **limits, **passes)
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     return net, largest * fear, {**metrics, **calibration(remembered, share)}
-
-
-def divergence(
-    logits: jax.Array, target: jax.Array, loss: FearLoss, noise: jax.Array, temperature: jax.Array | float
-) -> jax.Array:
-    """How far an appraisal is from what was observed, elementwise (Eq. 3, without its term that no weight moves).
-
-    `ce` is the forward divergence without sampling: its minimiser is the probability itself. `gumbel_fwd` is the same
-    of a relaxed sample. `gumbel_rev` is the letter of the paper, with the sample in front: it is nearly linear in the
-    probability, so its minimiser is the more likely of 0 and 1, and a cost rarer than one half is not feared at all.
-
-    Args:
-      logits: [...]; target: [...] in [0, 1], smoothed by 0.01 for the sampled divergences.
-      noise: [...] logistic, for the sampled divergences; temperature: tau.
-    """
-    if loss == "ce":
-        return cross_entropy(logits, target)
-    sample, target = relaxed_bernoulli(logits, noise, temperature), smoothed(target)
-    return bernoulli_kl(target, sample) if loss == "gumbel_fwd" else bernoulli_kl(sample, target)
-
-
-def relaxed_bernoulli(logits: jax.Array, noise: jax.Array, temperature: jax.Array | float) -> jax.Array:
-    """The two-class Gumbel-softmax sigmoid((l + noise) / tau) in (0, 1), through which gradients flow.
-
-    `noise` [...] is a draw of the standard logistic distribution, which is the difference of two Gumbels.
-    """
-    return jax.nn.sigmoid((logits + noise) / temperature)
 
 
 def calibration(probability: jax.Array, outcome: jax.Array) -> Metrics:

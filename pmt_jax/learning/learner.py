@@ -12,14 +12,14 @@ import jax.numpy as jnp
 from .. import tasks
 from ..config.settings import Config, Hyper
 from ..errors import UsageError
-from . import constraint, critics, fear, regret, rollout, schedules, sharding
+from . import constraint, critics, fear, letter, regret, rollout, schedules, sharding
 from .debug import check_finite, watched
 from .maths import running_moments
 from .maths.advantages import gae
 from .optimise import init_train_state
 from .policies import Team, policy_samples, update_policies
 from .setup import Setup, make_setup
-from .types import Batch, Critic, LearnerState, Metrics, Tag
+from .types import Batch, Critic, LearnerState, Metrics, Tag, TrainState
 
 Train = Callable[..., tuple[LearnerState, Metrics]]
 
@@ -93,9 +93,7 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         cost_critic=Critic(
             init_train_state(setup.nets.init_cost_critic(tagged[Tag.COST_CRITIC])), running_moments.init(heads)
         ),
-        fear=init_train_state(setup.nets.init_fear(tagged[Tag.FEAR], hyper.fear_start))
-        if setup.method.cost_signal == "fear"
-        else None,
+        fear=_init_fear(setup, tagged[Tag.FEAR]) if setup.method.cost_signal == "fear" else None,
         regret=(
             jax.vmap(init_train_state)(setup.nets.init_regret(tagged[Tag.REGRET]))
             if setup.method.ratio_weight == "regret"
@@ -111,6 +109,12 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
     )
 
 
+def _init_fear(setup: Setup, key: jax.Array) -> TrainState:
+    if setup.method.letter:
+        return letter.init_fear(setup, key)
+    return init_train_state(setup.nets.init_fear(key, jnp.nan))
+
+
 def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[LearnerState, Metrics]:
     """One update: act, appraise, estimate advantages, fit the critics, update the policies."""
     setup = dataclasses.replace(setup, nets=setup.nets.fast)
@@ -123,9 +127,10 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
     largest = jnp.maximum(state.largest_cost, batch.cost.max((0, 1)))
+    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
     (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
-        partial(fear.appraise_fear, setup, hyper, now, state.fear, batch, largest, tagged[Tag.FEAR]),
-        partial(regret.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
+        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, largest, tagged[Tag.FEAR]),
+        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
     )
 
     # 3 Advantages of reward and of danger, which counts in units of the limit.
@@ -133,14 +138,14 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     value, next_value = critics.values(state.critic, setup.nets.value, seen)
     cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
-    horizon, previous = setup.vector.horizon, state.constraint.estimate
-    cost_signal = constraint.in_limits(hyper, cost_signal, horizon)
+    cost_signal = constraint.in_unit(setup, hyper, cost_signal)
     advantage, returns = gae(batch.reward[..., None] if setup.own_critics else batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
 
     # 4 The constraint: how far costs are beyond the limit, and what the policies pay for them.
-    estimate = constraint.estimate_cost(hyper, batch, previous, horizon)
-    excess = constraint.cost_excess(hyper, estimate)
+    previous = state.constraint.estimate
+    estimate = constraint.estimate_cost(setup, hyper, batch, previous, cost_value)
+    excess = constraint.cost_excess(setup, hyper, estimate)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
     held = constraint.integrate(setup, hyper, state.constraint, excess)
     actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)

@@ -84,6 +84,7 @@ class Networks:
       num_actors: N, or 1 if all agents share one.
       num_agents: N.
       own_critics: critics see an agent's own observation [O], not the state [S]; all agents share one.
+      own_fear: each agent has a fear network of its own with heads [K], weights with a leading [N].
       fused: whether C++ code computes them where it can (see `fused`).
     """
 
@@ -93,6 +94,7 @@ class Networks:
     obs_dim: int
     state_dim: int
     own_critics: bool
+    own_fear: bool
     actor: Actor
     critic: MLP
     cost_critic: MLP
@@ -132,7 +134,14 @@ class Networks:
 
         Fear begins low: from one half it takes tens of updates to come down, and its noise hides the first danger.
         """
-        weights = self.fear_net.init(key, jnp.zeros(self.state_dim))
+
+        def one(key: jax.Array) -> Params:
+            return self.fear_net.init(key, jnp.zeros(self.state_dim))
+
+        if self.own_fear:
+            weights = jax.vmap(lambda i: one(jax.random.fold_in(key, i)))(jnp.arange(self.num_agents))
+        else:
+            weights = one(key)
         return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start))
 
     def set_fear_to_cost_rate(self, params: Params, cost_rate: jax.Array) -> Params:
@@ -148,7 +157,8 @@ class Networks:
 
     def _with_fear_bias(self, params: Params, bias: jax.Array) -> Params:
         layers = params["params"]
-        head = {**layers[self.fear_head], "bias": bias.ravel()}
+        head = layers[self.fear_head]
+        head = {**head, "bias": bias.reshape(head["bias"].shape)}
         return {**params, "params": {**layers, self.fear_head: head}}
 
     def init_regret(self, key: jax.Array) -> Params:
@@ -198,8 +208,14 @@ class Networks:
 
     def fear(self, params: Params, state: jax.Array) -> jax.Array:
         """Logits of the fear prior network: state [..., S] -> [..., N, K]."""
+        if self.own_fear:
+            return jax.vmap(self.fear_of_one, (0, None), -2)(params, state)
         heads = self._apply(self.fear_net, params, state)
         return heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
+
+    def fear_of_one(self, params: Params, state: jax.Array) -> jax.Array:
+        """Logits of one agent's own fear prior network: state [..., S] -> [..., K]."""
+        return self._apply(self.fear_net, params, state)
 
     def regret(self, params: Params, state: jax.Array, action: jax.Array) -> jax.Array:
         """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
@@ -225,9 +241,10 @@ def build(config: Config, spec: EnvSpec, method: Method) -> Networks:
         obs_dim=spec.obs_dim,
         state_dim=spec.state_dim,
         own_critics=own_critics,
+        own_fear=method.letter,
         actor=Actor(mlp(spec.action_dim, 0.01)),
         critic=mlp(1, 1.0),
         cost_critic=mlp(spec.num_costs if own_critics else spec.num_agents * spec.num_costs, 1.0),
-        fear_net=mlp(spec.num_agents * spec.num_costs, 0.01),
+        fear_net=mlp(spec.num_costs if method.letter else spec.num_agents * spec.num_costs, 0.01),
         regret_net=mlp(spec.action_dim, 0.01),
     )

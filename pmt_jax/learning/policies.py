@@ -58,17 +58,17 @@ def policy_samples(
 
     Args:
       price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of observations; cost_advantage:
-        [T, B, N, K]; log_weight: [T, B, N].
+        [T, B, N, K]; log_weight: [T, B, N], or with one that moves in the epochs [T, B, N, epochs + 1].
     """
-    _, advantage = standardise(advantage)
-    centred, scaled = standardise(cost_advantage, COST_STD_FLOOR)
-    if setup.config.regret_response == "advantage":
-        scaled, log_weight = scaled * jnp.exp(-log_weight)[..., None], jnp.zeros_like(log_weight)
+    letter = setup.method.letter
+    centred = scaled = cost_advantage
+    if not letter:
+        _, advantage = standardise(advantage)
+        centred, scaled = standardise(cost_advantage, COST_STD_FLOOR)
     reward_weight, cost_weight = weights(setup, price)
     each = advantage.reshape(*advantage.shape[:2], -1)
     hybrid = hybrid_advantage(each * reward_weight, scaled, cost_weight)
-    if setup.config.regret_response == "one_sided":
-        log_weight = log_weight * jnp.sign(hybrid)
+    moves = log_weight.ndim > batch.log_prob.ndim
     samples = PolicySamples(
         obs=batch.obs,
         action=batch.action,
@@ -76,10 +76,12 @@ def policy_samples(
         log_prob=batch.log_prob,
         mean=batch.mean,
         std=batch.std,
-        advantage=hybrid,
+        advantage=jnp.broadcast_to(each, hybrid.shape) if letter else hybrid,
         cost_advantage=centred,
-        log_weight=log_weight,
+        log_weight=log_weight[..., -1] if moves else log_weight,
         factor=jnp.ones_like(batch.log_prob),
+        paid=jnp.sum(cost_weight * scaled, axis=-1) if letter else None,
+        moving_log_weight=log_weight[..., :-1] if moves else None,
     )
     return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), samples)
 
@@ -94,7 +96,7 @@ def _sequential(
     ) -> tuple[tuple[TrainState, Constraint, jax.Array], Metrics]:
         actor, constraint, factor = carry
         net, own, mine, excess = select_agent(team._replace(actor=actor, constraint=constraint), i)
-        mine, key = dataclasses.replace(mine, factor=factor), jax.random.fold_in(tagged[Tag.ACTOR], i)
+        mine, key = corrected(mine, factor), jax.random.fold_in(tagged[Tag.ACTOR], i)
         net, reach, metrics = update_policy(setup, hyper, now, net, mine, excess + own.lowered, key)
         log_ratio, metrics["kl_per_agent"] = policy_change(setup, net.params, mine)
         own = respond(setup, hyper, own, mine, excess, log_ratio, reach)
@@ -133,6 +135,16 @@ def _simultaneous(
     return actor, constraint, metrics
 
 
+def corrected(samples: PolicySamples, factor: jax.Array) -> PolicySamples:
+    """An agent's samples with the ratios of those before it, M [R].
+
+    With `paid` costs M weighs the reward's advantage alone, M A_r - sum_k lambda_k A_c,k: Equation 7 as printed.
+    """
+    if samples.paid is None:
+        return dataclasses.replace(samples, factor=factor)
+    return dataclasses.replace(samples, advantage=factor * samples.advantage - samples.paid)
+
+
 def select_agent(tree: Any, i: jax.Array | int) -> Any:
     """Agent i's part of a pytree with leading [N]."""
     return jax.tree.map(lambda x: x[i], tree)
@@ -169,12 +181,27 @@ def update_policy(
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
     loss = policy_loss(setup, hyper, now, samples, violation)
-    new, metrics = fit(net, loss, samples, key, **limits, **passes)
+    fit_all = fit if samples.moving_log_weight is None else _fit_as_weights_move
+    new, metrics = fit_all(net, loss, samples, key, **limits, **passes)
     first_order = setup.method.surrogate == "first_order"
     # Nothing clips FOCOPS's ratios. The paper ends an update beyond this bound; here the step is shortened to it.
     kl_max = jnp.minimum(hyper.kl_max, now.kl_limit) if first_order else hyper.kl_max
     params, metrics["share_of_step"] = _limit_kl(setup, kl_max, net.params, new.params, samples)
     return TrainState(params, new.opt_state), jnp.zeros(()), metrics
+
+
+def _fit_as_weights_move(
+    net: TrainState, loss: Loss, samples: PolicySamples, key: jax.Array, *, epochs: int, **options: Any
+) -> tuple[TrainState, Metrics]:
+    """As `fit`, but epoch e has the weights moving_log_weight[:, e]."""
+
+    def epoch(net: TrainState, given: tuple[jax.Array, jax.Array]) -> tuple[TrainState, Metrics]:
+        rows = dataclasses.replace(samples, log_weight=given[0], moving_log_weight=None)
+        return fit(net, loss, rows, given[1], epochs=1, **options)
+
+    weights = jnp.moveaxis(jnp.asarray(samples.moving_log_weight), -1, 0)
+    net, metrics = jax.lax.scan(epoch, net, (weights, jax.random.split(key, epochs)))
+    return net, jax.tree.map(lambda x: x[-1], metrics)
 
 
 def policy_loss(setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySamples, violation: jax.Array) -> Loss:

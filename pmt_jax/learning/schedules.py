@@ -9,6 +9,8 @@ from ..config.settings import Config
 from .maths.pytree import pytree
 from .types import Hyper
 
+FEAR_LR_START = 1e-2  # learning rate of fear in the first update; in update t it is this over t, while above emotion_lr
+
 
 @pytree
 class Schedule:
@@ -38,6 +40,6 @@ def at(config: Config, hyper: Hyper, update: jax.Array) -> Schedule:
         critic_lr=hyper.critic_lr * left,
         emotion_lr=emotion_lr,
         # A network that knows nothing yet learns faster, so that fear does not lag where danger is dense at once.
-        fear_lr=jnp.maximum(emotion_lr, hyper.fear_lr_start / (update + 1) * left),
+        fear_lr=jnp.maximum(emotion_lr, FEAR_LR_START / (update + 1) * left),
         kl_limit=hyper.kl_limit * left**2,
     )

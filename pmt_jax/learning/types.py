@@ -46,6 +46,19 @@ class TrainState:
 
 
 @pytree
+class RehearsingState(TrainState):
+    """A network in training with the replay buffer D that it rehearses: U updates of M states (see letter.py).
+
+    state: [U, M, S] as the network saw them; answer: [U, M, N, K], what it said of them then; count: [] int32, updates
+    stored so far, the latest in place of the oldest.
+    """
+
+    state: jax.Array
+    answer: jax.Array
+    count: jax.Array
+
+
+@pytree
 class Critic:
     """A value function in training, with the moments of its returns (heads in their own, normalised units)."""
 
@@ -145,6 +158,8 @@ class PolicySamples:
       cost_advantage: [R, K], centred, in units of the limit.
       log_weight: [R], bias on the probability ratio.
       factor: [R], M: the probability ratios of the agents updated before.
+      paid: [R], what the costs take off the advantage where no factor weighs it; None if `advantage` is less that.
+      moving_log_weight: [R, epochs], the bias in each epoch; None if it is `log_weight` in all of them.
     """
 
     obs: jax.Array
@@ -157,6 +172,8 @@ class PolicySamples:
     cost_advantage: jax.Array
     log_weight: jax.Array
     factor: jax.Array
+    paid: jax.Array | None = None
+    moving_log_weight: jax.Array | None = None
 
 
 @pytree
@@ -182,7 +199,7 @@ class LearnerState(ActingState):
       actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K]; of each agent's own observation V(o_i) -> [], Vc(o_i) -> [K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
-        without them.
+        without them. By the letter fear has a network for each agent, and is a RehearsingState.
       constraint: estimate of the cost, multiplier and lowered limit, [N, K].
       largest_cost: [N, K], the largest cost of a step so far that was noticed; fear is a share of it.
       state_moments: [S], of raw states.

@@ -85,6 +85,11 @@ def _fear(source: str, like: LearnerState, setup: Setup) -> dict[str, Any]:
     ours, theirs = setup.vector.spec, other.vector.spec
     params, largest = state.fear.params, state.largest_cost
     if ours.num_agents != theirs.num_agents and ours.num_costs == theirs.num_costs:
+        if other.nets.own_fear:
+            raise UsageError(
+                f"{source} has a fear network for each of its {theirs.num_agents} agents; init_fear needs a run of "
+                f"{ours.num_agents} agents, or one of f4sg or mixed"
+            )
         params = _shared_by_agents(params, other.nets.fear_head, theirs.num_agents, ours.num_agents)
         largest = jnp.repeat(largest.max(1, keepdims=True), ours.num_agents, 1)
     return {
@@ -114,6 +119,7 @@ def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
             f"{name} of {source} has other shapes than this run's; start from a run of a task with the same "
             "observations and agents, with the same hidden and layer_norm, and of a method that also "
             "has one policy for all agents (mappo, ippo) or one for each (all others), and critics of the same "
-            "(ippo and ippo_l have those of observations)"
+            "(ippo and ippo_l have those of observations), and one fear network for all agents or one for each "
+            "(f4sg_letter)"
         )
     return jax.tree.map(lambda x, new: x[jnp.arange(new.shape[0]) % x.shape[0]], theirs, like)

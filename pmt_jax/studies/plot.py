@@ -59,6 +59,8 @@ METHOD_COLOURS = {
     "crpo": "#8c4a75",
     "p3o": "#8a3d00",
     "focops": "#00553d",
+    "f4sg_letter": "#f2a477",
+    "r4sg_letter": "#73c9b0",
 }
 OTHER_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, GREY)  # of settings of one method, of methods not in METHODS
 DASHES = ("", "6 2", "1.5 2", "6 2 1.5 2")  # in line widths, as SVG has them

@@ -65,7 +65,7 @@ class Part(NamedTuple):
 
 
 def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) -> Points:
-    """Every point by name: `fear_l2=0,lambda_lr=0.1`, after `draw=3` if drawn, after `task=lane` if there are several.
+    """Every point by name: `emotion_l2=0,lambda_lr=2`, after `draw=3` if drawn, after `task=lane` if there are several.
 
     Args:
       preset, fixed: as for `load_config`, for all points. Options in a fixed `env` are laid next to those that vary.

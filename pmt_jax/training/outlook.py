@@ -1,9 +1,10 @@
-"""What can be known of a limit before training: that these settings cannot hold costs to it in these steps."""
+"""What can be known before training: that these settings cannot hold costs to the limit, or are not the paper's."""
 
 from __future__ import annotations
 
 import math
 
+from ..config.load import convert, read_preset
 from ..config.methods import label
 from ..config.settings import Config
 from ..learning.setup import Setup
@@ -13,6 +14,30 @@ LITTLE = 1.5  # times what it began as: a multiplier that grows by less has hard
 
 
 def notes(setup: Setup) -> list[str]:
+    """What a user should know of a run before it trains, a sentence each."""
+    return [*_of_letter(setup), *_of_limit(setup)]
+
+
+def _of_letter(setup: Setup) -> list[str]:
+    """That a method of the paper's equations as printed runs with other settings than the preset's."""
+    config = setup.config
+    if not setup.method.letter:
+        return []
+    preset = {name: convert(name, value) for name, value in read_preset("letter").items()}
+    sizes = {"num_envs": 1, "minibatches": 1, "rollout_length": config.rollout_length, "steps": config.rollout_length}
+    printed = Config(**sizes, **preset)
+    values = {name: (repr(getattr(config, name)), repr(getattr(printed, name))) for name in preset}
+    other = [f"{name} = {ours} (the paper: {theirs})" for name, (ours, theirs) in values.items() if ours != theirs]
+    if not other:
+        return []
+    more = f" and {len(other) - 3} more" if len(other) > 3 else ""
+    return [
+        f"note: {label(config.method)} has the paper's equations, and these settings differ from its text: "
+        f"{', '.join(other[:3])}{more}; --preset letter has them all"
+    ]
+
+
+def _of_limit(setup: Setup) -> list[str]:
     """A sentence for each reason why the limit that was asked for may not be kept; none if the task's own is used."""
     config, spec = setup.config, setup.vector.spec
     given, method = Limits.configured(config, spec.num_costs), label(config.method)

@@ -129,7 +129,7 @@ def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
         (["eval", "runs/none"], "runs/none is not a run folder"),
         (["eval", "lane", "--policy", "zero"], "task 'lane' has no baseline policies"),
         (["eval", "voltage_33", "--policy", "dropp"], "unknown policy 'dropp'; did you mean 'droop'?"),
-        (["train", "lane", "--preset", "paper"], "unknown preset 'paper'; did you mean 'paper_letter'?"),
+        (["train", "lane", "--preset", "paper_letter"], "unknown preset 'paper_letter'; did you mean 'letter'?"),
         (["train", "lane", "--eval-interval", "-1"], "eval_interval must be a number of updates, or 0 for none"),
         (["export", "runs/none"], "the following arguments are required: -o/--out"),
         (["export", "runs/none", "-o", "x", "--seed", "first"], "--seed must be a whole number of at least 0"),

@@ -135,7 +135,6 @@ def test_a_file_of_any_bytes_is_read_or_gets_a_sentence(text: bytes):
         (f"train {'x' * 300}.toml", "cannot read the configuration file"),
         ("train lane --num-envs 1e12", "num_envs must be at least 1 and fit 32 bits"),
         ("train lane --num-envs 1e9", "does not fit 32 bits; ask for a smaller batch"),
-        ("train lane --temperature 0", "temperature must be a number above 0, not 0.0"),
         ("train lane --lambda-init 1e38", "lambda_init = 1e+38 lies above lambda_max = 20.0"),
         ("train lane --actor-lr 1e39", "actor_lr must be a number that is not negative and fits 32 bits"),
         ("render none --episode 4294967296", "--episode must be a whole number of at most 2147483647"),

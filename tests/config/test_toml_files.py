@@ -50,9 +50,9 @@ def test_what_cannot_be_extended_gets_a_sentence(base: str, says: str, tmp_path:
 
 
 def test_a_preset_lies_over_the_file_and_under_the_flags(tmp_path: pathlib.Path):
-    file = write(tmp_path, mine='extends = "lane"\nkappa = 2.0\n[method.f4sg]\nfear_time = "next"\n')
-    config = load_config(file, method="f4sg", preset="reference", lambda_kp=0.25)
-    assert (config.kappa, config.fear_time, config.lambda_kp, config.limit_lr) == (2.0, "next", 0.25, 0.0)
+    file = write(tmp_path, mine='extends = "lane"\ngae_lambda = 0.5\n[method.f4sg]\nfear_time = "next"\n')
+    config = load_config(file, method="f4sg", preset="letter", lambda_kp=0.25)
+    assert (config.gae_lambda, config.fear_time, config.lambda_kp) == (1.0, "current", 0.25)
 
 
 def test_the_command_lines_options_join_those_of_the_file():

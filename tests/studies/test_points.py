@@ -85,7 +85,7 @@ steps = 9600
 method = "f4sg"
 random = 2
 draw_seed = 3
-set.fear_l2 = "log:0.01:1"
+set.emotion_l2 = "log:0.01:1"
 """
 
 

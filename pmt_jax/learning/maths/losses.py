@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -89,17 +91,24 @@ def huber(error: jax.Array, delta: float = 10.0) -> jax.Array:
     return optax.losses.huber_loss(error, delta=delta)
 
 
-def value_loss(value: jax.Array, old_value: jax.Array, target: jax.Array, clip: jax.Array | float) -> jax.Array:
-    """The worse of the Huber losses of the prediction and of its clipped move (Eq. 12).
+def value_loss(
+    value: jax.Array,
+    old_value: jax.Array,
+    target: jax.Array,
+    clip: jax.Array | float,
+    penalty: Callable[[jax.Array], jax.Array] = huber,
+) -> jax.Array:
+    """The worse of the losses of the prediction and of its clipped move (Eq. 12).
 
     Args:
       value, old_value, target: [...] in normalised units; clip: how far a value may profit from moving.
+      penalty: of an error; the paper squares it.
 
     Returns:
       [...]; its mean is the loss.
     """
     clipped = old_value + jnp.clip(value - old_value, -clip, clip)
-    return jnp.maximum(huber(target - value), huber(target - clipped))
+    return jnp.maximum(penalty(target - value), penalty(target - clipped))
 
 
 def cross_entropy(logits: jax.Array, target: jax.Array) -> jax.Array:
