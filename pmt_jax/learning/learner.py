@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -125,11 +126,8 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
-    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
-    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
-        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
-        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
-    )
+    appraised = _appraise(setup, hyper, now, state, batch, tagged)
+    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = appraised
 
     # 3 Advantages of reward and of danger.
     seen = critics.inputs(batch)
@@ -175,6 +173,17 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
         **_named("fear", fear_metrics),
         **_named("regret", regret_metrics),
     }
+
+
+def _appraise(
+    setup: Setup, hyper: Hyper, now: schedules.Schedule, state: LearnerState, batch: Batch, tagged: dict[Tag, jax.Array]
+) -> tuple[Any, ...]:
+    """What fear and regret make of a batch: each its networks, what it computes, and metrics."""
+    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
+    return sharding.in_parallel(
+        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, tagged[Tag.FEAR]),
+        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
+    )
 
 
 def _named(part: str, metrics: Metrics) -> Metrics:
