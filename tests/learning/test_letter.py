@@ -347,12 +347,16 @@ def test_both_together_are_a_row_of_your_own(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.full
 @pytest.mark.parametrize("method", ROWS)
 def test_a_seed_beside_others_is_the_seed_alone(method: str):
-    train = jax.vmap(make_train(load_config("switch", method, "letter", **SMALL)))
-    keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    together, alone = jax.jit(train)(keys), jax.jit(train)
-    for seed in (0, 2):
-        mine = jax.tree.map(lambda x, seed=seed: x[seed : seed + 1], together)
-        chex.assert_trees_all_equal(checkpoint.pack(alone(keys[seed : seed + 1])), checkpoint.pack(mine))
+    train = jax.jit(jax.vmap(make_train(load_config("switch", method, "letter", **SMALL))))
+
+    def third(seeds: list[int]) -> dict[str, np.ndarray]:
+        found = train(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+        return checkpoint.pack(jax.tree.map(lambda x: x[-1], found))
+
+    among = third([0, 1, 2])
+    chex.assert_trees_all_equal(among, third([7, 8, 2]))
+    # A program of one seed multiplies other matrices than one of three, so the last bits differ.
+    chex.assert_trees_all_close(among, third([2]), rtol=1e-3, atol=1e-4)
 
 
 def test_a_state_that_was_saved_goes_on_as_if_it_had_not_been():
