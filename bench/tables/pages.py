@@ -109,19 +109,10 @@ def as_switches(_: str) -> str:
     for name, method in METHODS.items():
         order = f"{method.order}, {'one shared actor' if method.share_actor else 'an actor each'}"
         cost = "-" if method.constraint == "none" else str(method.cost_signal)
-        printed = "yes" if method.letter else "-"
-        rest = [method.ratio_weight, method.surrogate.replace("_", " "), method.critic, printed]
+        surrogate = "as printed" if method.letter else method.surrogate.replace("_", " ")
+        rest = [method.ratio_weight, surrogate, method.critic]
         body.append([f"`{name}`", order, method.constraint.replace("_", " "), cost, *rest])
-    columns = (
-        "method",
-        "update",
-        "constraint",
-        "cost signal",
-        "ratio weight",
-        "surrogate",
-        "critics see",
-        "as printed",
-    )
+    columns = ("method", "update", "constraint", "cost signal", "ratio weight", "surrogate", "critics see")
     return markdown(columns, body)
 
 

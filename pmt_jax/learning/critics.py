@@ -46,7 +46,7 @@ def fit_critic(
 ) -> tuple[Critic, Metrics]:
     """Updates the moments of the returns once, then fits the critic to them in the new units.
 
-    By the letter there are no moments, and errors are squared.
+    With the letter, as in the paper, there are no moments, and errors are squared.
 
     Args:
       clip: half-width of the interval of values, in those units.

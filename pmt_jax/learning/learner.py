@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -127,11 +128,8 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
     largest = jnp.maximum(state.largest_cost, batch.cost.max((0, 1)))
-    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
-    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = sharding.in_parallel(
-        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, largest, tagged[Tag.FEAR]),
-        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
-    )
+    appraised = _appraise(setup, hyper, now, state, batch, largest, tagged)
+    (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = appraised
 
     # 3 Advantages of reward and of danger, which counts in units of the limit.
     seen = critics.inputs(batch)
@@ -184,6 +182,27 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
         **_named("fear", fear_metrics),
         **_named("regret", regret_metrics),
     }
+
+
+def _appraise(
+    setup: Setup,
+    hyper: Hyper,
+    now: schedules.Schedule,
+    state: LearnerState,
+    batch: Batch,
+    largest: jax.Array,
+    tagged: dict[Tag, jax.Array],
+) -> tuple[Any, ...]:
+    """What fear and regret make of a batch: each its networks, what it computes, and metrics.
+
+    Args:
+      largest: [N, K], the largest cost of a step so far.
+    """
+    fear_of, regret_of = (letter, letter) if setup.method.letter else (fear, regret)
+    return sharding.in_parallel(
+        partial(fear_of.appraise_fear, setup, hyper, now, state.fear, batch, largest, tagged[Tag.FEAR]),
+        partial(regret_of.appraise_regret, setup, hyper, now, state.regret, batch, tagged[Tag.REGRET]),
+    )
 
 
 def _named(part: str, metrics: Metrics) -> Metrics:

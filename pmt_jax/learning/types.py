@@ -199,7 +199,7 @@ class LearnerState(ActingState):
       actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K]; of each agent's own observation V(o_i) -> [], Vc(o_i) -> [K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
-        without them. By the letter fear has a network for each agent, and is a RehearsingState.
+        without them. With the letter fear has a network for each agent, and is a RehearsingState.
       constraint: estimate of the cost, multiplier and lowered limit, [N, K].
       largest_cost: [N, K], the largest cost of a step so far that was noticed; fear is a share of it.
       state_moments: [S], of raw states.

@@ -20,7 +20,7 @@ from pmt_jax.learning.maths import losses
 from pmt_jax.learning.maths.advantages import gae
 from pmt_jax.learning.optimise import fit
 from pmt_jax.learning.types import Batch, LearnerState, RehearsingState, Tag
-from pmt_jax.training import outlook
+from pmt_jax.training import checkpoint, outlook
 from runs import TINY, assert_same_run
 from small import SMALL, program
 
@@ -308,10 +308,9 @@ def test_the_excess_is_of_the_cost_critics_values():
 def test_other_methods_have_nothing_of_it(monkeypatch: pytest.MonkeyPatch):
     for name in [name for name in dir(letter) if callable(getattr(letter, name))]:
         monkeypatch.setattr(letter, name, None)
-    for method in ("mixed", "macpo"):
-        setup = make_setup(load_config("switch", method, **SMALL))
-        state = jax.eval_shape(functools.partial(learner.init, setup), setup.hyper, jax.random.key(0))
-        jax.eval_shape(functools.partial(learner.train_step, setup), setup.hyper, state)
+    setup = make_setup(load_config("switch", "mixed", **SMALL))
+    state = jax.eval_shape(functools.partial(learner.init, setup), setup.hyper, jax.random.key(0))
+    jax.eval_shape(functools.partial(learner.train_step, setup), setup.hyper, state)
     assert [name for name, method in METHODS.items() if method.letter] == list(ROWS)
 
 
@@ -343,18 +342,32 @@ def test_both_together_are_a_row_of_your_own(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.full
 @pytest.mark.parametrize("method", ROWS)
 def test_a_seed_beside_others_is_the_seed_alone(method: str):
-    train = make_train(load_config("switch", method, "letter", **SMALL))
-    keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    together = jax.jit(jax.vmap(train))(keys)
-    for seed in range(3):
-        alone = jax.jit(jax.vmap(train))(keys[seed][None])
-        each = jax.tree.map(lambda x, seed=seed: x[seed : seed + 1], together)
-        chex.assert_trees_all_equal(jax.tree.map(jax.random.key_data, (alone[0].key, each[0].key))[0], each[0].key)
-        plain = [dataclasses.replace(state, key=jnp.zeros(()), rollout=None) for state in (alone[0], each[0])]
-        chex.assert_trees_all_equal((plain[0], alone[1]), (plain[1], each[1]))
+    train = jax.jit(jax.vmap(make_train(load_config("switch", method, "letter", **SMALL))))
+
+    def third(seeds: list[int]) -> dict[str, np.ndarray]:
+        found = train(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+        return checkpoint.pack(jax.tree.map(lambda x: x[-1], found))
+
+    among = third([0, 1, 2])
+    chex.assert_trees_all_equal(among, third([7, 8, 2]))
+    # A program of one seed multiplies other matrices than one of three, so the last bits differ.
+    chex.assert_trees_all_close(among, third([2]), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", ["f4sg_letter", pytest.param("r4sg_letter", marks=pytest.mark.full)])
+def test_a_state_that_was_saved_goes_on_as_if_it_had_not_been():
+    step, hyper = F4SG.step, F4SG.setup.hyper
+    state = F4SG.init(hyper, jax.random.key(3))
+    for _ in range(2):
+        state, _ = step(hyper, state)
+    assert state.fear.count == 2 and state.fear.answer[:2].all() and not state.fear.answer[2:].any()
+    again = checkpoint.unpack(checkpoint.pack(state), state)
+    chex.assert_trees_all_equal(*(checkpoint.pack(step(hyper, each)) for each in (state, again)))
+    empty = dataclasses.replace(state, fear=dataclasses.replace(state.fear, answer=jnp.zeros_like(state.fear.answer)))
+    assert step(hyper, empty)[1]["fear/loss"] != step(hyper, state)[1]["fear/loss"]  # it learns from what was saved
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ROWS)
 def test_a_run_that_continues_is_the_run_in_one_go(method: str, tmp_path, cli):
     words = ["train", "lane", *TINY, "--method", method, "--preset", "letter", "--no-cache", "--seeds", 2]
     assert cli(*words, "--steps", 800, "--out", tmp_path / "whole")[0] == 0
@@ -363,11 +376,22 @@ def test_a_run_that_continues_is_the_run_in_one_go(method: str, tmp_path, cli):
     assert_same_run(tmp_path / "parts", tmp_path / "whole")
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("method", ROWS)
-def test_a_run_on_lane_learns_the_task(method: str):
+def on_lane(method: str) -> tuple[LearnerState, dict[str, np.ndarray]]:
     config = load_config("lane", method, "letter", num_envs=48, rollout_length=25, steps=48 * 25 * 60, hidden=(32, 32))
     state, metrics = jax.jit(make_train(config))(jax.random.key(0))
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((state.actor.params, state.fear, state.regret)))
-    reward = np.asarray(metrics["episode_reward"])
-    assert reward[-5:].mean() > reward[:5].mean() + 2
+    return state, jax.tree.map(np.asarray, metrics)
+
+
+@pytest.mark.full
+def test_regret_learns_lane_within_its_limit():
+    _, metrics = on_lane("r4sg_letter")
+    assert metrics["episode_reward"][-10:].mean() > metrics["episode_reward"][0] + 8
+    assert metrics["episode_cost"][-10:].mean() <= 1
+
+
+@pytest.mark.full
+def test_fear_of_lane_falls_where_nothing_costs_and_policies_learn():
+    state, metrics = on_lane("f4sg_letter")
+    assert metrics["fear/on_safe"][0] > 0.4 and metrics["fear/on_safe"][-10:].mean() < 0.1
+    assert np.ptp(metrics["episode_reward"]) > 5 and state.fear.count == 60
