@@ -18,7 +18,7 @@ from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import Batch, LearnerState, Metrics, Tag
 
 SMALL = {"num_envs": 8, "rollout_length": 25, "steps": 8 * 25 * 3, "log_interval": 1, "hidden": (8,), "epochs": 2}
-SMALL |= {"episode_starts": "together"}  # each batch is an episode
+SMALL |= {"episode_starts": "together", "cost_margin": 0.0}  # each batch is an episode
 
 
 class Program(NamedTuple):

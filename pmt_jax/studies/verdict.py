@@ -69,7 +69,7 @@ def _advice(log: RunLog, beyond: Sequence[int]) -> str:
     if lowest > NEAR * limit:
         stronger = "--lambda-lr" if constraint == "lagrangian" else "--limit-lr"
         return f"{whose}: costs never came near the limit (lowest row {lowest:.3g}); raise {stronger}, or train longer"
-    return f"{whose}: costs stay about the limit; --cost-margin 0.2 holds them below it"
+    return f"{whose}: costs stay about the limit; a higher --cost-margin holds them below it"
 
 
 def _constraint(log: RunLog) -> str:

@@ -163,7 +163,7 @@ def test_a_multiplier_grows_by_the_same_share_below_every_limit():
             made.hyper(cost_limit=limit, lambda_lr=0.75),
             made.init(made.setup.hyper, jax.random.key(0)),
         )
-        np.testing.assert_allclose(after.constraint.multiplier, 0.78 * np.exp(0.75 / 3), rtol=1e-6)
+        np.testing.assert_allclose(after.constraint.multiplier, 2.0 * np.exp(0.75 / 3), rtol=1e-6)
 
 
 @pytest.mark.full
@@ -218,7 +218,7 @@ def test_regret_stands_still_where_nothing_ever_costs():
 @pytest.mark.full
 def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     setup, state, batch = acted()
-    hyper = setup.hyper
+    hyper = dataclasses.replace(setup.hyper, surrogate_weight=jnp.float32(1.0))
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
     now = schedules.at(setup.config, hyper, state.update)
@@ -239,7 +239,8 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
         chex.assert_trees_all_close(net.params, policies.select_agent(actor.params, i), rtol=1e-5, atol=1e-6)
         log_ratio, _ = policies.policy_change(setup, net.params, mine)
         surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
-        expected = 0.78 + hyper.lambda_lr * (excess[i, 0] + surrogate)
+        step = jnp.clip(excess[i, 0] + surrogate, -1, 1) / setup.config.num_updates
+        expected = 2.0 * jnp.exp(hyper.lambda_lr * step)
         np.testing.assert_allclose(constraint.multiplier[i, 0], expected, rtol=1e-5)
         factor, total = factor * jnp.exp(log_ratio), total + log_ratio
     np.testing.assert_allclose(factor, jnp.exp(total), rtol=1e-5)

@@ -78,6 +78,8 @@ TINY = (
     1,
     "--method",
     "mappo_l",
+    "--episode-starts",
+    "together",
 )
 
 
@@ -101,17 +103,17 @@ def run(file: pathlib.Path) -> pathlib.Path:
 
 
 def test_a_row_names_each_agent(run: pathlib.Path):
-    """Agent 0 costs 18 of an allowed 10, agent 1 nothing; their mean is within the limit."""
+    """Agent 0 costs 18 of an allowed 10 (8 with the margin), agent 1 nothing; their mean is within the limit."""
     for found in rows(run):
         for name in ("episode_cost", "true_episode_cost", "eval/episode_cost"):
             assert (found[name], found[f"{name}/agent_0"], found[f"{name}/agent_1"]) == (9, 18, 0)
             assert found[f"{name}_worst"] == 18
         assert found["within_limit"] == found["eval/within_limit"] == 0
         assert found["episode_cost_beyond"] == 8
-        assert found["cost_excess"] == found["cost_excess/agent_0"] == pytest.approx(0.32)
-        assert found["cost_excess/agent_1"] == pytest.approx(-0.4)
+        assert found["cost_excess"] == found["cost_excess/agent_0"] == pytest.approx(1.25)
+        assert found["cost_excess/agent_1"] == pytest.approx(-1)
     first, last = rows(run)[0], rows(run)[-1]
-    assert last["lambda/agent_0"] > first["lambda/agent_0"] > 0.78 > first["lambda/agent_1"] > last["lambda/agent_1"]
+    assert last["lambda/agent_0"] > first["lambda/agent_0"] > 2 > first["lambda/agent_1"] > last["lambda/agent_1"]
     assert last["lambda"] == pytest.approx((last["lambda/agent_0"] + last["lambda/agent_1"]) / 2)
 
 
