@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config.load import load_config, to_toml
-from ..config.settings import Config
+from ..config.settings import FIELDS, Config
 from ..errors import UsageError
 from ..files import writing
 from ..learning.maths import running_moments
@@ -70,7 +70,9 @@ def load(name: str, physics: str | None = None) -> tuple[Setup, ActingState]:
       UsageError: there is no such policy, its file is damaged, or the engine cannot run here.
     """
     table = _read(name)
-    config = load_config(tomllib.loads(str(table.pop("config"))))
+    stored = tomllib.loads(str(table.pop("config")))
+    # A policy only acts, so settings of its training that no longer exist say nothing about it.
+    config = load_config({name: value for name, value in stored.items() if name in FIELDS})
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     del table["about"]
     return setup, checkpoint.unpack(_widened(table), _like(setup))
