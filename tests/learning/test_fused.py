@@ -158,7 +158,7 @@ def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeyp
         raise native.NoLibrary("needs a C++ compiler; found none")
 
     monkeypatch.setattr(native, "targets", none)
-    fused._targets.cache_clear()
+    fused.function_names.cache_clear()
     lines = []
     try:
         with tasks.announcing(lines.append):
@@ -167,4 +167,4 @@ def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeyp
         module, params = network(7, (16,), 2)
         fitted(module, params, rows_of(), jax.random.key(0))
     finally:
-        fused._targets.cache_clear()
+        fused.function_names.cache_clear()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs import physics
 from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
@@ -189,7 +190,7 @@ def test_4x3_is_2x6_cut_in_halves():
 def test_cost_depends_on_the_action_alone(variant, action, cost):
     env = made(variant)
     given = jnp.clip(joint_action(**action), -1, 1).reshape(-1)
-    np.testing.assert_array_equal(env._get_cost(given), np.full((2, 1), cost))
+    np.testing.assert_array_equal(env.cost_of(given), np.full((2, 1), cost))
 
 
 def test_actions_are_clamped_and_seen_by_the_next_state():
@@ -204,7 +205,7 @@ def test_reward_at_the_goal_is_one_and_falls_as_the_task_says():
 
     def reward(place, turn, goal):
         carry = env.restore(np.r_[np.zeros(48), place, turn], np.zeros(54), goal, np.zeros(40)).carry
-        return float(env._get_reward(carry))
+        return float(env.reward_of(carry))
 
     goal = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     assert reward(hand_over.GOAL, goal, goal) == pytest.approx(1)
@@ -218,7 +219,7 @@ def test_a_fallen_object_ends_the_episode():
 
     def ended(height: float) -> bool:
         qpos = np.r_[np.zeros(48), 0, -0.5, height, 1, 0, 0, 0]
-        return bool(env._get_termination(env.restore(qpos, np.zeros(54), [1, 0, 0, 0], np.zeros(40)).carry.physics))
+        return bool(env.ends(env.restore(qpos, np.zeros(54), [1, 0, 0, 0], np.zeros(40)).carry.physics))
 
     assert (ended(0.1999), ended(0.2001), ended(np.nan)) == (True, False, True)
 
@@ -284,7 +285,9 @@ def test_fingertips_sense_the_egg_and_not_their_own_weight(holding):
 
 def test_c_engine_reads_the_sensors_that_plain_steps_leave_behind():
     env, state = made(), jax.tree.map(lambda x: x[:4], starts())
-    after, out = jax.vmap(env._engine.step)(state.carry.physics, jnp.zeros((4, 40)))
+    readout = {"sensors": ("sensordata", slice(None))}
+    engine = physics.make_engine(env.model, substeps=hand_over.SUBSTEPS, readout=readout, physics="mujoco")
+    after, out = jax.vmap(engine.step)(state.carry.physics, jnp.zeros((4, 40)))
     data = mujoco.MjData(env.model)
     for i in range(4):
         mujoco.mj_resetData(env.model, data)
