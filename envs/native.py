@@ -197,12 +197,15 @@ def _compile(compiler: Compiler, code: Code, target: pathlib.Path) -> str | None
 
 
 def _command(compiler: Compiler, code: Code) -> list[str]:
-    """The command without its paths, on which the library does not depend."""
+    """The command without its paths, on which the library does not depend; flags in $CXX win, as they come last."""
+    words = compiler.command
+    count = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
+    program, chosen = words[:count], words[count:]
     arm = platform.machine() in ("aarch64", "arm64")
     flags = [*FLAGS, "-mcpu=native" if arm else "-march=native", *(f"-D{macro}" for macro in code.defined)]
-    if compiler.command[-1] == "c++" and "zig" in pathlib.Path(compiler.command[0]).name:
+    if program[-1] == "c++" and "zig" in pathlib.Path(program[0]).name:
         flags.append("-nostdlib++")  # or its first use builds a C++ library, for 40 seconds
-    return [*compiler.command, *flags]
+    return [*program, *flags, *chosen]
 
 
 def key_of(compiler: Compiler, code: Code) -> str:

@@ -436,7 +436,7 @@ def small_code(*bodies: str) -> native.Code:
     return cpu.code(header(tables_of.tables(small(*bodies), 1, {})))
 
 
-def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli):
+def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli, quick_doctor):
     env = envs.make("ant_2x4")
     assert env.engine == "mujoco" and physics.resolve("auto") == "mujoco"
     assert "'fused' steps this model" in tasks.advice(env) and "found none (install g++" in tasks.advice(env)
@@ -458,6 +458,16 @@ def test_compilers_are_asked_in_the_order_of_the_readme(fresh, monkeypatch):
     found = [[pathlib.Path(compiler.command[0]).name, *compiler.command[1:]] for compiler in native.compilers()]
     assert found == [["mine", "-pipe"], ["c++"], ["g++"], ["clang++"], ["zig", "c++"]]
     assert [compiler.version for compiler in native.compilers()] == 4 * ["fake 1.0"] + ["clang of zig"]
+
+
+def test_flags_of_the_chosen_compiler_have_the_last_word(small_library, fresh, monkeypatch):
+    told = fresh.parent / "told"
+    says = 'case "$*" in *--version) echo "fake 1.0"; exit 0;; esac\n'
+    mine = script(fresh, "mine", says + f'echo "$@" > {told}\n' + COPYING.format(small_library))
+    monkeypatch.setenv("CXX", f"{mine} -O1")
+    native.library(small_code())
+    words = told.read_text().split()
+    assert words.index("-O3") < words.index("-O1")
 
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, HANGING], ids=["fails", "writes garbage", "hangs"])
