@@ -165,7 +165,7 @@ def test_same_numbers_jitted_or_not(name: str):
     chex.assert_trees_all_close(raw_data(plain), raw_data(jitted), rtol=1e-5, atol=1e-5)
 
 
-@each_code("voltage_33", "multi_goal_point_0")
+@each_code("hand_over_2x6", "voltage_33", "multi_goal_point_0")
 def test_batches_nest(name: str):
     env = made(name)
     state = start(name)
@@ -176,7 +176,7 @@ def test_batches_nest(name: str):
     chex.assert_trees_all_close(raw_data(unnested), raw_data(flat), rtol=1e-5, atol=1e-5)
 
 
-@each_code("voltage_33", "multi_goal_point_0")
+@each_code("hand_over_2x6", "voltage_33", "multi_goal_point_0")
 def test_auto_reset_starts_anew_every_time(name: str):
     vector = VectorEnv(made(name), 2, horizon=2)
     step = jax.jit(vector.step)

@@ -39,7 +39,7 @@ def test_declarations_name_what_is_there(name):
 def blocks(name: str, agent: int = 0, **options: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """An agent's observation and the global state by block, and the quantities that they show, right after a reset."""
     env: Any = envs.make(name, **options)
-    state = env.reset(jax.random.key(3))
+    state = jax.jit(env.reset)(jax.random.key(3))
     observation, whole = slices(env.declares.observation), slices(env.declares.state)
     seen = {block: np.asarray(state.obs[agent][where]) for block, where in observation.items()}
     return seen, {block: np.asarray(state.global_state[where]) for block, where in whole.items()}, env.raw(state)

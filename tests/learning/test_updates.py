@@ -63,7 +63,8 @@ def test_a_trial_does_not_depend_on_the_others_of_its_program():
 
 @pytest.mark.full
 def test_jitted_or_not():
-    config = load_config("lane", method="mappo_l", **{**SMALL, "num_envs": 2, "rollout_length": 3, "steps": 6})
+    small = {"num_envs": 2, "rollout_length": 2, "steps": 4, "epochs": 1, "minibatches": 1}
+    config = load_config("lane", method="mappo_l", **{**SMALL, **small})
     train = make_train(config)
     jitted, _ = jax.jit(train)(jax.random.key(0))
     with jax.disable_jit():

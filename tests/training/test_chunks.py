@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from pmt_jax import load_config
 from pmt_jax.training import chunks
-from runs import ARGUMENTS, STEPS, assert_same_run, rows
+from runs import ARGUMENTS, STEPS, TINY, assert_same_run, rows
 
-LONG = (*ARGUMENTS, "--log-interval", 10**6, "--steps", 1400)  # one row, of 14 updates
+LONG = ("lane", *TINY, "--method", "mappo", "--seeds", 2, "--no-cache")
+LONG += ("--log-interval", 10**6, "--steps", 1400)  # one row, of 14 updates
 relaxed = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 

@@ -34,6 +34,11 @@ def stepper(**options):
 
 
 @functools.cache
+def restore():
+    return jax.jit(made().restore)
+
+
+@functools.cache
 def starts(count: int = COUNT):
     return jax.jit(jax.vmap(made().reset))(jax.random.split(jax.random.key(0), count))
 
@@ -132,7 +137,7 @@ def test_observation_layout():
     last_action = np.linspace(-1, 1, 40, dtype=np.float32)
     goal_quat = np.array([0, 1, 0, 0], np.float32)
     force = rng.uniform(-0.4, 0.4, 48).astype(np.float32)
-    state = env.restore(qpos, qvel, goal_quat, last_action, joint_force=force)
+    state = jax.jit(env.restore)(qpos, qvel, goal_quat, last_action, joint_force=force)
     obs, seen = np.asarray(state.obs), np.asarray(state.global_state)
     np.testing.assert_array_equal(seen, np.concatenate([obs[0, :187], obs[1, :187], obs[0, 187:]]))
     np.testing.assert_array_equal(obs[0, 187:], obs[1, 187:])
@@ -204,7 +209,7 @@ def test_reward_at_the_goal_is_one_and_falls_as_the_task_says():
     env = made()
 
     def reward(place, turn, goal):
-        carry = env.restore(np.r_[np.zeros(48), place, turn], np.zeros(54), goal, np.zeros(40)).carry
+        carry = restore()(np.r_[np.zeros(48), place, turn], np.zeros(54), np.asarray(goal), np.zeros(40)).carry
         return float(env.reward_of(carry))
 
     goal = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
@@ -219,7 +224,7 @@ def test_a_fallen_object_ends_the_episode():
 
     def ended(height: float) -> bool:
         qpos = np.r_[np.zeros(48), 0, -0.5, height, 1, 0, 0, 0]
-        return bool(env.ends(env.restore(qpos, np.zeros(54), [1, 0, 0, 0], np.zeros(40)).carry.physics))
+        return bool(env.ends(restore()(qpos, np.zeros(54), np.array([1, 0, 0, 0]), np.zeros(40)).carry.physics))
 
     assert (ended(0.1999), ended(0.2001), ended(np.nan)) == (True, False, True)
 
@@ -273,10 +278,11 @@ def test_energy_does_not_grow_with_actions_off():
         assert max(energies) <= energies[0] + 1e-4 and energies[-1] < 0.9 * energies[0]
 
 
+@pytest.mark.full
 def test_fingertips_sense_the_egg_and_not_their_own_weight(holding):
     env = made()
     in_the_air = np.r_[np.full(48, 0.3), 0, -0.4, 9, 1, 0, 0, 0]
-    state = env.restore(in_the_air, np.zeros(54), [1, 0, 0, 0], np.zeros(40))
+    state = restore()(in_the_air, np.zeros(54), np.array([1, 0, 0, 0]), np.zeros(40))
     after = episodes(env, jnp.zeros((60, 1, 2, 20)), jax.tree.map(lambda x: x[None], state))
     assert np.abs(after.obs[-1, 0, :, 137:167]).max() < 0.01
     weight = np.asarray(holding[1].next_obs[-10:, :, 0, 137:167]).reshape(-1, 5, 6)[..., :3]

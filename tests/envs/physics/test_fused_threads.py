@@ -198,7 +198,9 @@ def at_a_box(model: mujoco.MjModel, count: int) -> np.ndarray:
 
 
 @compiled
-@pytest.mark.parametrize("size", [".5 .3 .2", ".1 .1 .1", "300 .5 .7"])
+@pytest.mark.parametrize(
+    "size", [".5 .3 .2", *(pytest.param(x, marks=pytest.mark.full) for x in (".1 .1 .1", "300 .5 .7"))]
+)
 def test_capsules_and_spheres_touch_a_box_as_in_c(size):
     model = exact(mujoco.MjModel.from_xml_string(AT_A_BOX.format(size=size)))
     made_of, rows = tables(model, 1, FORCES_OF_THE_FREE), at_a_box(model, 1000)

@@ -87,7 +87,7 @@ def test_reproduces_the_recorded_steps_on_fused(name):
 
 
 # MJX compiles a robot for up to a minute: the one in a fluid in .ci/run, the others by hand. Contacts on MJX are those
-# of the ant in tests/envs/ant/test_corridor.py.
+# of the hands in tests/envs/hands/test_hand_over.py.
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=pytest.mark.full if x == "velocity_swimmer_2x1" else pytest.mark.slow) for x in NAMES],
