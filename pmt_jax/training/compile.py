@@ -135,7 +135,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     config = setup.config
     hyper, keys, axes = setup.vmap_arguments
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
-    placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys))
+    placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys)) if setup.mesh else None
     everywhere = sharding.replicated(setup.mesh)
     state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(xla_options(once=True))(hyper, keys)
 
