@@ -193,7 +193,7 @@ def test_an_engine_that_cannot_run_here_is_left_out_with_a_sentence(monkeypatch:
     assert said[0].startswith("left out: environment, a, warp, ") and "physics 'warp' needs an NVIDIA GPU" in said[0]
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_certificates_are_of_the_episodes_that_policies_are_evaluated_in():
     env: Any = envs.make("voltage_33")
     rows = once.data_rows("voltage_33", 2)

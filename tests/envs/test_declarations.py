@@ -18,11 +18,12 @@ from envs.errors import TaskError, typed
 from envs.voltage.control import VoltageControl, load_scenario
 from paths import ROOT
 
-LATE = {"voltage_141", *(x for x in envs.names() if x.startswith("multi_goal_") and not x.endswith("point_1"))}
+LATE = {"voltage_141": pytest.mark.full, "multi_goal_ant_2": pytest.mark.full}
+LATE |= {f"multi_goal_{x}": pytest.mark.slow for x in ("point_0", "point_2", "ant_0", "ant_1")}
 NEEDS = {"plain": set(), "scene": {"qpos"}, "map": {"vm_pu"}}  # of the quantities that a picture reads
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.full] if x in LATE else []) for x in envs.names()])
+@pytest.mark.parametrize("name", [pytest.param(x, marks=LATE.get(x, ())) for x in envs.names()])
 def test_declarations_name_what_is_there(name):
     env = envs.make(name)
     state = jax.eval_shape(env.reset, jax.random.key(0))

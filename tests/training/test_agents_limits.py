@@ -239,7 +239,7 @@ def test_zones_of_a_grid_have_a_column_each(scope: str, agents: int, costs: int)
         assert len(found) == (agents if agents > 1 else costs if costs > 1 else 0)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_zones_of_a_grid_are_judged_one_by_one(tmp_path: pathlib.Path, cli):
     """Two of six zones have costs; their mean over agents is a third of these."""
     out, file, limit = tmp_path / "run", tmp_path / "steps.npz", 12

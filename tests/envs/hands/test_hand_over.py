@@ -358,7 +358,7 @@ def test_a_thousand_random_steps_break_nothing(physics):
     assert not broken.any()
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_the_egg_can_be_handed_over():
     """Actions found by search (docs/figures/hand_over.py), from the three starts that they were found on."""
     env, found = made(), json.loads(CATCH.read_text())
