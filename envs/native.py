@@ -234,13 +234,23 @@ def _loads(path: pathlib.Path, code: Code) -> str | None:
     return None
 
 
+def cache_of_user() -> pathlib.Path:
+    """Where this package keeps what it compiles: `~/.cache/pmt-jax`, or below $XDG_CACHE_HOME.
+
+    Raises:
+      RuntimeError: the user has no home.
+    """
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
+    # By the XDG standard, a path that is empty or relative does not count.
+    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
+    return home / "pmt-jax"
+
+
 @functools.cache
 def cache_folder() -> pathlib.Path:
     """Where libraries are kept: a cache folder, or one of this process alone where none can be written."""
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
     with contextlib.suppress(OSError, RuntimeError):
-        home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
-        place = home / "pmt-jax" / "fused"
+        place = cache_of_user() / "fused"
         place.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=place):
             return place

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Mapping
 
 from ...errors import TaskError
+from ...native import cache_of_user
 
 _FOLDER = pathlib.Path(__file__).parent
 _PARTS = ("smooth", "contacts", "solver", "readouts", "step")
@@ -41,19 +42,13 @@ def step_ptx(tables: str, architecture: str) -> str:
     options = (f"--gpu-architecture=compute_{architecture.replace('.', '')}", *_OPTIONS)
     made_of = [*_version(), source, *options, *(part for item in headers.items() for part in item)]
     key = hashlib.sha256("\0".join(map(str, made_of)).encode()).hexdigest()[:32]
-    kept = _cache() / f"step-{key}.ptx"
+    kept = cache_of_user() / "fused" / f"step-{key}.ptx"
     with contextlib.suppress(OSError, UnicodeDecodeError):
         return kept.read_text()
     ptx = compiled(source, headers, options)
     with contextlib.suppress(OSError):  # a home that cannot be written: the next process compiles again
         _put(kept, ptx)
     return ptx
-
-
-def _cache() -> pathlib.Path:
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
-    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
-    return home / "pmt-jax" / "fused"
 
 
 def _put(path: pathlib.Path, text: str) -> None:
