@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import fcntl
 import gc
 import importlib.metadata
@@ -52,13 +54,18 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("CXX", f"{compiler} -O1")  # for processes that tests start, too
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def memory_is_bounded():
-    """What tests of a file compiled is of little use to the next file's."""
+    """Programs are forgotten when they are too many, and their memory goes back to the system."""
     yield
     if psutil.Process().memory_info().rss > MOST_MEMORY:
+        import runs
+
+        runs.forget()
         jax.clear_caches()
         gc.collect()
+        with contextlib.suppress(AttributeError):  # of glibc
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(autouse=True, scope="session")
