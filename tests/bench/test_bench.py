@@ -660,7 +660,7 @@ def test_a_gradient_step_is_timed_by_part():
 # The study's tables
 
 
-def stored(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
+def run_of_three_seeds(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
     """A run of three seeds and ten points whose true episode cost is constant."""
     points, seeds = 10, len(true_cost)
     config = {"cost_seen": seen, "lambda_init": 2.0, "method": method} | settings
@@ -694,7 +694,7 @@ def test_a_probe_compares_fear_with_the_same_settings_and_corrects_over_all_meas
     pid = {"cost_value_clip": np.inf, "max_grad_norm": np.inf, "lambda_rule": "pid"}
 
     def cell(method: str, costs: list[float], recipe: dict) -> dict:
-        run = stored(method, 0.5, costs)
+        run = run_of_three_seeds(method, 0.5, costs)
         run["config"] += "\n" + "\n".join(
             f"{k} = {json.dumps(v).lower().replace('infinity', 'inf')}" for k, v in recipe.items()
         )
