@@ -52,12 +52,6 @@ _compiled: dict[Any, tuple[LearnerState, Programs]] = {}
 _evaluations: dict[Any, Callable[..., Any]] = {}
 
 
-def forget() -> None:
-    """Lets go of all programs."""
-    _compiled.clear()
-    _evaluations.clear()
-
-
 def _key(setup: Setup, *more: object) -> Any:
     """What the programs of a setup depend on; None if they are not to be shared."""
     config = setup.config
