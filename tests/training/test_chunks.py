@@ -69,6 +69,7 @@ def test_rows_and_states_do_not_depend_on_the_chunks(
     assert_same_run(tmp_path / "run", whole)
 
 
+@pytest.mark.full
 def test_a_run_that_is_stopped_within_a_row_goes_on_with_the_row(tmp_path: pathlib.Path, cli, monkeypatch):
     """Of a row as long as the run, in chunks of 5 updates and, stopped after the second and fourth, of 3."""
     monkeypatch.setattr(chunks, "plan", lambda config, done, _: min(5, 14 - done))
