@@ -44,7 +44,7 @@ for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the 
 
 
 gc.set_threshold(100_000)  # as `pmt` has it: traces make many objects that stay
-MOST_MEMORY = 1.7e9  # bytes of a process of the tests, beyond which it forgets what it compiled
+MOST_MEMORY = 1.5e9  # bytes of a process of the tests, beyond which it forgets what it compiled
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -54,9 +54,9 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("CXX", f"{compiler} -O1")  # for processes that tests start, too
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def memory_is_bounded():
-    """What JAX has compiled is forgotten when it is too much, and its memory freed; `runs` keeps its own."""
+    """After a file JAX forgets what it has compiled if that is much, and the memory is freed; `runs` keeps its own."""
     yield
     if psutil.Process().memory_info().rss > MOST_MEMORY:
         jax.clear_caches()
