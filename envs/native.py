@@ -31,8 +31,8 @@ from .versions import installed_version
 
 HEADER = pathlib.Path(__file__).parent / "native.h"
 INSTALL = "install g++ or clang++, or pip install 'pmt-jax[native]'"
-_FLAGS = "-O3 -std=c++17 -shared -fPIC -fno-math-errno -fno-trapping-math -ffp-contract=fast".split()
-_PATIENCE = 600.0  # seconds for a compiler; one on a loaded machine took 20
+FLAGS = "-O3 -std=c++17 -shared -fPIC -fno-math-errno -fno-trapping-math -ffp-contract=fast".split()
+PATIENCE = 600.0  # seconds for a compiler; one on a loaded machine took 20
 
 
 class NoLibrary(Exception):
@@ -118,14 +118,14 @@ def _asked(command: tuple[str, ...]) -> tuple[Compiler, ...]:
 
 def obstacle(name: str) -> str | None:
     """Why a library cannot be made here, the rest of a sentence; None if a compiler is there and has not failed."""
-    if name in _failures:
-        return f"could not be compiled: {_failures[name]} ({INSTALL})"
+    if name in failures:
+        return f"could not be compiled: {failures[name]} ({INSTALL})"
     if next(compilers(), None) is None:
         return f"needs a C++ compiler; found none ({INSTALL})"
     return None
 
 
-_failures: dict[str, str] = {}  # of this process, by the library's name
+failures: dict[str, str] = {}  # of this process, by the library's name
 
 
 def describe() -> str:
@@ -158,7 +158,7 @@ def library(code: Code) -> pathlib.Path:
     """
     reasons = []
     for compiler in compilers():
-        found = _folder() / f"{code.name}_{_key(compiler, code)}.so"
+        found = cache_folder() / f"{code.name}_{key_of(compiler, code)}.so"
         if found.exists() and _loads(found, code) is None:
             return found
         announce(f"compiling {code.what} ({compiler.command[0]}) ...")
@@ -168,8 +168,8 @@ def library(code: Code) -> pathlib.Path:
         reasons.append(f"{shlex.join(compiler.command)}: {reason}")
     if not reasons:
         raise NoLibrary(f"needs a C++ compiler; found none ({INSTALL})")
-    _failures[code.name] = "; ".join(reasons)
-    raise NoLibrary(f"could not be compiled: {_failures[code.name]} ({INSTALL})")
+    failures[code.name] = "; ".join(reasons)
+    raise NoLibrary(f"could not be compiled: {failures[code.name]} ({INSTALL})")
 
 
 def _compile(compiler: Compiler, code: Code, target: pathlib.Path) -> str | None:
@@ -184,7 +184,7 @@ def _compile(compiler: Compiler, code: Code, target: pathlib.Path) -> str | None
         command = [*_command(compiler, code), *paths, "-o", str(part)]
         zig = {name: str(target.parent / "zig") for name in ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")}
         try:
-            done = _run(command, _PATIENCE, **{name: value for name, value in zig.items() if name not in os.environ})
+            done = _run(command, PATIENCE, **{name: value for name, value in zig.items() if name not in os.environ})
         except (OSError, subprocess.SubprocessError) as error:
             return str(error)
         if done.returncode:
@@ -197,15 +197,19 @@ def _compile(compiler: Compiler, code: Code, target: pathlib.Path) -> str | None
 
 
 def _command(compiler: Compiler, code: Code) -> list[str]:
-    """The command without its paths, on which the library does not depend."""
+    """The command without its paths, on which the library does not depend; flags in $CXX win, as they come last."""
+    words = compiler.command
+    count = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
+    program, chosen = words[:count], words[count:]
     arm = platform.machine() in ("aarch64", "arm64")
-    flags = [*_FLAGS, "-mcpu=native" if arm else "-march=native", *(f"-D{macro}" for macro in code.defined)]
-    if compiler.command[-1] == "c++" and "zig" in pathlib.Path(compiler.command[0]).name:
+    flags = [*FLAGS, "-mcpu=native" if arm else "-march=native", *(f"-D{macro}" for macro in code.defined)]
+    if program[-1] == "c++" and "zig" in pathlib.Path(program[0]).name:
         flags.append("-nostdlib++")  # or its first use builds a C++ library, for 40 seconds
-    return [*compiler.command, *flags]
+    return [*program, *flags, *chosen]
 
 
-def _key(compiler: Compiler, code: Code) -> str:
+def key_of(compiler: Compiler, code: Code) -> str:
+    """A hash of all that the library depends on."""
     sources = [source.read_text() for source in code.sources]
     parts = (*sources, code.made, compiler.version, _command(compiler, code), cpu_flags(), installed_version("jaxlib"))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:20]
@@ -230,13 +234,23 @@ def _loads(path: pathlib.Path, code: Code) -> str | None:
     return None
 
 
-@functools.cache
-def _folder() -> pathlib.Path:
-    """Where libraries are kept: a cache folder, or one of this process alone where none can be written."""
+def cache_of_user() -> pathlib.Path:
+    """Where this package keeps what it compiles: `~/.cache/pmt-jax`, or below $XDG_CACHE_HOME.
+
+    Raises:
+      RuntimeError: the user has no home.
+    """
     chosen = os.environ.get("XDG_CACHE_HOME", "")
+    # By the XDG standard, a path that is empty or relative does not count.
+    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
+    return home / "pmt-jax"
+
+
+@functools.cache
+def cache_folder() -> pathlib.Path:
+    """Where libraries are kept: a cache folder, or one of this process alone where none can be written."""
     with contextlib.suppress(OSError, RuntimeError):
-        home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
-        place = home / "pmt-jax" / "fused"
+        place = cache_of_user() / "fused"
         place.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=place):
             return place

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import fcntl
+import gc
 import importlib.metadata
 import os
 import pathlib
@@ -14,6 +17,7 @@ import subprocess
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's complaints about programs it takes from the cache
 
 import jax
+import psutil
 import pytest
 
 # Tests compile far longer than they run: with the least of optimisation programs compile in a quarter of the time.
@@ -37,6 +41,28 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the background or under nohup
     if signal.getsignal(number) == signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+gc.set_threshold(100_000)  # as `pmt` has it: traces make many objects that stay
+MOST_MEMORY = 1.5e9  # bytes of a process of the tests, beyond which it forgets what it compiled
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """With less optimisation C++ compiles in half the time; `-m full` has all of it."""
+    compiler = next(filter(shutil.which, ("c++", "g++", "clang++")), None)
+    if compiler and "not full" in config.getoption("markexpr"):
+        os.environ.setdefault("CXX", f"{compiler} -O1")  # for processes that tests start, too
+
+
+@pytest.fixture(autouse=True, scope="module")
+def memory_is_bounded():
+    """After a file JAX forgets what it has compiled if that is much, and the memory is freed; `runs` keeps its own."""
+    yield
+    if psutil.Process().memory_info().rss > MOST_MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        with contextlib.suppress(AttributeError):  # of glibc
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -72,14 +98,25 @@ def cli(capsys: pytest.CaptureFixture[str]):
     return run
 
 
+@pytest.fixture
+def quick_doctor(monkeypatch: pytest.MonkeyPatch):
+    """A doctor that starts no processes of its own."""
+    from pmt_jax.cli import doctor
+
+    monkeypatch.setattr(doctor, "check_rendering", lambda: iter(()))
+    monkeypatch.setattr(doctor, "check_cache", lambda: doctor.Finding("ok", "compile cache", ""))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def programs_are_shared():
-    """Training compiles a program once a process (`runs.compile_once`)."""
+    """Training and evaluations compile a program once a process (see `runs`)."""
+    from pmt_jax.policies import evaluate
     from pmt_jax.training import trainer
-    from runs import compile_once
+    from runs import compile_once, evaluate_once
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer, "compile_run", compile_once)
+        patch.setattr(evaluate, "evaluate_seeds", evaluate_once)
         yield
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import pathlib
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,9 +15,8 @@ import numpy as np
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import LearnerState
 from pmt_jax.output import Say
-from pmt_jax.policies import load
 from pmt_jax.training import checkpoint
-from pmt_jax.training.compile import Programs, compile_run
+from pmt_jax.training.compile import Programs, compile_run, evaluate_seeds
 
 STEPS = 1600
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
@@ -27,9 +28,8 @@ def rows(out: pathlib.Path) -> list[dict]:
 
 
 def saved(out: pathlib.Path) -> dict[str, np.ndarray]:
-    """The whole content of a run's newest checkpoint: last and best."""
-    states = [checkpoint.pack(load.load_run(out, which)[1]) for which in ("last", "best")]
-    return {f"{i}{path}": x for i, state in enumerate(states) for path, x in state.items()}
+    """The whole content of a run's newest checkpoint: `['last']` and `['best']`."""
+    return checkpoint.newest(out, warnings.warn).packed
 
 
 def assert_same_run(out: pathlib.Path, other: pathlib.Path) -> None:
@@ -49,18 +49,34 @@ def environment() -> dict[str, str]:
 
 
 _compiled: dict[Any, tuple[LearnerState, Programs]] = {}
+_evaluations: dict[Any, Callable[..., Any]] = {}
+
+
+def _key(setup: Setup, *more: object) -> Any:
+    """What the programs of a setup depend on; None if they are not to be shared."""
+    config = setup.config
+    if setup.mesh or setup.debug or pathlib.Path(config.task).suffix:  # a file may have changed
+        return None
+    trials = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(vars(setup.trials) if setup.trials else None))
+    return repr(config.replace(steps=10**9, init="", init_fear="")), repr(setup.method), trials, more
 
 
 def compile_once(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """`compile_run`, but runs of one process share programs that are the same."""
-    config = setup.config
-    if setup.mesh or setup.debug or pathlib.Path(config.task).suffix:  # a file may have changed
+    key = _key(setup)
+    if key is None:
         return compile_run(setup, say)
-    trials = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(vars(setup.trials) if setup.trials else None))
-    key = (repr(config.replace(steps=10**9, init="", init_fear="")), repr(setup.method), trials)
     if key not in _compiled:
         _compiled[key] = compile_run(setup, say)
     else:
         say("compiled in 0.0 s (by a test before this one)")
     state, programs = _compiled[key]
     return jax.tree.map(lambda x: x.copy(), state), programs
+
+
+def evaluate_once(setup: Setup, *how: object, **more: object) -> Callable[..., Any]:
+    """`evaluate_seeds`, but the same function for the same evaluation, so that JAX compiles it once."""
+    key = _key(setup, how, tuple(sorted(more.items())))
+    if key is None:
+        return evaluate_seeds(setup, *how, **more)
+    return _evaluations.setdefault(key, evaluate_seeds(setup, *how, **more))

@@ -278,7 +278,7 @@ def test_the_host_launches_what_xla_launches(name):
 
 
 def test_an_xla_without_the_call_is_noticed(monkeypatch):
-    monkeypatch.setattr(gpu, "_CALL", "no_such_call")
+    monkeypatch.setattr(gpu, "CALL", "no_such_call")
     assert not gpu.knows_call.__wrapped__()
 
 

@@ -63,13 +63,6 @@ def setting(name: str, value: Any) -> Iterator[None]:
         jax.config.update(name, before)
 
 
-@pytest.fixture
-def quick_doctor(monkeypatch: pytest.MonkeyPatch):
-    """A doctor that starts no processes of its own."""
-    monkeypatch.setattr(doctor, "check_rendering", lambda: iter(()))
-    monkeypatch.setattr(doctor, "check_cache", lambda: doctor.Finding("ok", "compile cache", ""))
-
-
 def sentence(cli: Any, *command: object) -> str:
     """What a command that is refused says."""
     code, out, err = cli(*command)

@@ -251,8 +251,8 @@ class HandOver:
         tips = _fingertips(self._chains, physics)
         joint_force, touch = out["motor"] + out["constraint"], self._wrenches(out["sensors"], tips)
         carry = Carry(physics, before.goal_quat, joint_action, joint_force, touch)
-        cost = self._get_cost(joint_action)
-        outcome = self._get_reward(carry), cost, self._get_termination(physics)
+        cost = self.cost_of(joint_action)
+        outcome = self.reward_of(carry), cost, self.ends(physics)
         return self._state(carry, tips, *outcome, out["overflow"])
 
     def restore(
@@ -368,17 +368,17 @@ class HandOver:
         torque = jnp.cross(jnp.asarray(self.model.body_ipos[bodies], sensors.dtype), force)
         return -(sensors.reshape(HANDS, len(FINGERS), 6) + jnp.concatenate([force, torque], axis=-1))
 
-    def _get_reward(self, carry: Carry) -> jax.Array:
+    def reward_of(self, carry: Carry) -> jax.Array:
         """[] in (0, 1]: exp(-10 d - 0.2 theta), the object being d (m) away from the goal and turned by theta (rad)."""
         distance, angle = _goal_errors(carry)
         return jnp.exp(-10.0 * distance - 0.2 * angle)
 
-    def _get_cost(self, joint_action: jax.Array) -> jax.Array:
+    def cost_of(self, joint_action: jax.Array) -> jax.Array:
         """[N, 1]: 1 where a costly entry of the clamped action [40] is beyond its bound, whatever the hands then do."""
         costly = (jnp.abs(joint_action[np.array(self._costly)]) > self._free).any()
         return jnp.full((self.spec.num_agents, 1), costly.astype(joint_action.dtype))
 
-    def _get_termination(self, physics: PhysicsState) -> jax.Array:
+    def ends(self, physics: PhysicsState) -> jax.Array:
         """Whether the object fell, or the physics broke."""
         sound = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
         return ~(sound & (physics.qpos[HINGES + 2] > FALLEN))

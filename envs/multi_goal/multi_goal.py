@@ -157,16 +157,16 @@ class MultiGoal:
         kind, robots = ROBOTS[self.robot], self.num_agents
         slots = min(int(at_least("vase_slots", slots, 1)), chosen["vases"])
         self._kind = kind
-        self._vases = Vases(robots * kind.nq, robots * kind.nv, chosen["vases"], slots)
+        self.vases = Vases(robots * kind.nq, robots * kind.nv, chosen["vases"], slots)
         self._plan = plan(robots, self.num_hazards, chosen["vases"], reference=not self.own)
 
     def _build_engines(self, physics: str, threads: int | None) -> None:
-        self.model = model(self.robot, self.num_agents, self._vases.count, self.size)
-        stepped = model(self.robot, self.num_agents, self._vases.slots, self.size)
+        self.model = model(self.robot, self.num_agents, self.vases.count, self.size)
+        stepped = model(self.robot, self.num_agents, self.vases.slots, self.size)
         make = functools.partial(
             make_engine,
             stepped,
-            readout={"qacc": ("qacc", slice(self._vases.nv))},
+            readout={"qacc": ("qacc", slice(self.vases.nv))},
             forward=True,
             physics=physics,
             threads=threads,
@@ -217,7 +217,7 @@ class MultiGoal:
         """A new layout, everything at rest."""
         layout_key, heading_key, joint_key, key = jax.random.split(key, 4)
         start = self._at_rest.start()
-        dtype, agents, vases = start.qpos.dtype, self.num_agents, self._vases.count
+        dtype, agents, vases = start.qpos.dtype, self.num_agents, self.vases.count
         places, crowded = layout(layout_key, self._plan, self.size, dtype)
         robots, goals, hazards, vase_places = jnp.split(places, np.cumsum([agents, agents, self.num_hazards]).tolist())
         headings = jax.random.uniform(heading_key, (agents + vases,), dtype, 0.0, 2 * jnp.pi)
@@ -229,7 +229,7 @@ class MultiGoal:
             roots = jax.vmap(_upright, (0, 0, None))(robots, headings[:agents], ANT_HEIGHT)
             qpos = jnp.concatenate([roots, jnp.broadcast_to(joints, (agents, 8))], axis=1)
         boxes = jax.vmap(_upright, (0, 0, None))(vase_places, headings[agents:], VASE_HEIGHT)
-        still = jnp.zeros(self._vases.nv + 6 * vases, dtype)
+        still = jnp.zeros(self.vases.nv + 6 * vases, dtype)
         physics = PhysicsState(jnp.concatenate([qpos.ravel(), boxes.ravel()]), still, still)
         owner = jnp.zeros(vases, jnp.int32)
         return self._initial_state(Carry(physics, goals, hazards, owner, key, crowded.astype(dtype)))
@@ -246,14 +246,14 @@ class MultiGoal:
         key, goal_key = jax.random.split(before.key)
         goals, misplaced = self._new_goals(goal_key, before, physics, reached)
         after = Carry(physics, goals, before.hazards, owner, key, jnp.zeros_like(before.crowded))
-        obs, global_state = self._get_obs(after, out["qacc"])
+        obs, global_state = self.observe(after, out["qacc"])
         faults = {
             "physics_overflow": out["overflow"],
             "vases_left_out": left_out,
             "misplaced": before.crowded + misplaced,
         }
         info = self._get_info(reward, reached, costs) | faults
-        return State(obs, global_state, reward.mean(), self._get_cost(costs), self._ends(physics), info, after)
+        return State(obs, global_state, reward.mean(), self._get_cost(costs), self.ends(physics), info, after)
 
     def restore(
         self,
@@ -286,7 +286,7 @@ class MultiGoal:
         if hazards.shape != (self.num_hazards, 2):
             raise TaskError(f"hazards must have shape ({self.num_hazards}, 2), not {hazards.shape}")
         warmstart = jnp.zeros_like(qvel) if warmstart is None else jnp.asarray(warmstart, dtype)
-        count = self._vases.count
+        count = self.vases.count
         owner = jnp.zeros(count, jnp.int32) if vase_owner is None else jnp.asarray(vase_owner, jnp.int32)
         key = jax.random.key(0) if key is None else jnp.asarray(key)
         if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
@@ -331,7 +331,7 @@ class MultiGoal:
     def _initial_state(self, carry: Carry) -> State:
         """A State that no transition led to."""
         _, out, _ = self._advance(self._at_rest, carry.physics, jnp.zeros(self.model.nu))
-        obs, global_state = self._get_obs(carry, out["qacc"])
+        obs, global_state = self.observe(carry, out["qacc"])
         nothing = jnp.zeros(self.num_agents, carry.goals.dtype)
         info = self._get_info(nothing, nothing, dict.fromkeys(KINDS, nothing))
         zero = jnp.zeros((), nothing.dtype)
@@ -347,15 +347,15 @@ class MultiGoal:
         self, engine: Any, physics: PhysicsState, ctrl: jax.Array
     ) -> tuple[PhysicsState, dict[str, jax.Array], jax.Array]:
         """A step of an engine: the state, the readouts, and how many vases [] had no slot though they may move."""
-        if self._vases.count == self._vases.slots:
+        if self.vases.count == self.vases.slots:
             return *engine.step(physics, ctrl), jnp.zeros((), physics.qpos.dtype)
-        chosen, left_out = self._vases.choose(physics, self._robots(physics.qpos)[:, :2])
-        after, out = engine.step(self._vases.take(physics, chosen), ctrl)
-        return self._vases.put(physics, chosen, after), out, left_out
+        chosen, left_out = self.vases.choose(physics, self._robots(physics.qpos)[:, :2])
+        after, out = engine.step(self.vases.take(physics, chosen), ctrl)
+        return self.vases.put(physics, chosen, after), out, left_out
 
     def _robots(self, qpos: jax.Array) -> jax.Array:
         """[N, nq of one]."""
-        return qpos[: self._vases.nq].reshape(self.num_agents, -1)
+        return qpos[: self.vases.nq].reshape(self.num_agents, -1)
 
     def _distances(self, physics: PhysicsState, goals: jax.Array) -> jax.Array:
         """[N] m, of the robots to their goals."""
@@ -376,12 +376,12 @@ class MultiGoal:
         others = jnp.asarray([[j for j in agents if j != i] for i in agents])
         return jax.vmap(lambda body, seen: lidar(points[seen], body, self._bins, self._range))(bodies, others)
 
-    def _get_obs(self, carry: Carry, qacc: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def observe(self, carry: Carry, qacc: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Observations [N, O] and the state [S]: the blocks of all robots."""
         agents = self.num_agents
         bodies, robots = self._bodies(carry.physics)
         sense = functools.partial(sensors, self.robot, self._kind.site)
-        qvel, qacc = (x[: self._vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
+        qvel, qacc = (x[: self.vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
         parts = [jax.vmap(sense)(robots, qvel, qacc)]
         if self.own:
             to_goal = jax.vmap(lambda body, goal: lidar(goal[None], body, self._bins, self._range))
@@ -389,7 +389,7 @@ class MultiGoal:
         else:
             parts += [self._lidar(bodies, goal[None]) for goal in carry.goals]
         if self.level:
-            parts += [self._lidar(bodies, x) for x in (carry.hazards, self._vases.qpos(carry.physics)[:, :2])]
+            parts += [self._lidar(bodies, x) for x in (carry.hazards, self.vases.qpos(carry.physics)[:, :2])]
         if self.own:
             parts.append(self._lidar_of_others(bodies, robots[:, :2]))
         blocks = jnp.concatenate(parts, axis=1)
@@ -411,8 +411,8 @@ class MultiGoal:
             found["hazards"] = (apart < IN_HAZARD).any(1)
         groups = groups_of(self.robot, robots, self._whole)
         if "vases" in self.charges:
-            touched = touched_vases(groups, self._vases.qpos(physics))
-            moves = jnp.sqrt(jnp.sum(self._vases.qvel(physics)[:, :3] ** 2, axis=1)) >= MOVES
+            touched = touched_vases(groups, self.vases.qpos(physics))
+            moves = jnp.sqrt(jnp.sum(self.vases.qvel(physics)[:, :3] ** 2, axis=1)) >= MOVES
             velocity = []
             for agent in range(self.num_agents):  # in this order: a moving vase that two touch may cost both
                 owner = jnp.where(touched[agent], agent, owner)
@@ -435,7 +435,8 @@ class MultiGoal:
         info = {f"{name}_{i}": x[i] for name, x in each.items() for i in range(self.num_agents)}
         return info | {"reached": each["reached"].mean()} | {name: x.mean() for name, x in _merged(costs).items()}
 
-    def _ends(self, physics: PhysicsState) -> jax.Array:
+    def ends(self, physics: PhysicsState) -> jax.Array:
+        """[] bool, whether an ant lies on its back; points never end an episode."""
         if self._kind.least_height is None:
             return jnp.zeros((), bool)
         return (self._robots(physics.qpos)[:, 2] <= self._kind.least_height).any()
@@ -446,9 +447,9 @@ class MultiGoal:
         """The goals [N, 2], of which those that were reached are elsewhere, and how many [] of these found no room."""
         goals = before.goals
         checked = self.num_agents if self.own else 1  # the reference never checks robot 1
-        robots, vases = self._robots(physics.qpos)[:checked, :2], self._vases.qpos(physics)[:, :2]
+        robots, vases = self._robots(physics.qpos)[:checked, :2], self.vases.qpos(physics)[:, :2]
         still = jnp.concatenate([robots, before.hazards, vases])
-        apart = np.array([AGENT] * checked + [HAZARD] * self.num_hazards + [VASE] * self._vases.count)
+        apart = np.array([AGENT] * checked + [HAZARD] * self.num_hazards + [VASE] * self.vases.count)
         gaps = jnp.asarray(GOAL + np.concatenate([[GOAL] * (self.num_agents + 1), apart]), goals.dtype)
         half, misplaced = jnp.asarray(self.size - GOAL, goals.dtype), jnp.zeros((), goals.dtype)
         for i in range(self.num_agents):
@@ -464,7 +465,7 @@ class MultiGoal:
         """`qpos` with quaternions normalised; unit ones are left alone to the last bit, so that `raw` is inverted."""
         nq = self._kind.nq
         starts = [i * nq + 3 for i in range(self.num_agents) if self.robot == "ant"]
-        starts += [self._vases.nq + 7 * v + 3 for v in range(self._vases.count)]
+        starts += [self.vases.nq + 7 * v + 3 for v in range(self.vases.count)]
         if not starts:
             return qpos
         entries = jnp.asarray(starts)[:, None] + jnp.arange(4)

@@ -49,36 +49,36 @@ class CEngine(Remade):
         views = after_step(mujoco.MjData(model), readout)
         ends = np.cumsum([view.size for view in views]).tolist()
         self._parts = [(slice(end - view.size, end), view.shape) for view, end in zip(views, ends, strict=True)]
-        self._width = ends[-1]
-        self._target = register(self._advance)
+        self.width = ends[-1]
+        self._target = register(self.advance)
 
     @functools.cached_property
-    def _runner(self) -> TeamSteps | BatchSteps:
+    def runner(self) -> TeamSteps | BatchSteps:
         """Made by the first step, as JAX has its devices by then. They call at the same time and share the threads."""
-        runner = TeamSteps if needs_post_constraint(self._readout) else BatchSteps
+        kind = TeamSteps if needs_post_constraint(self._readout) else BatchSteps
         calls = jax.local_device_count() if jax.default_backend() == "cpu" else 1
-        return runner(self._model, self._substeps, self._readout, -(-self._threads // calls), self._forward)
+        return kind(self._model, self._substeps, self._readout, -(-self._threads // calls), self._forward)
 
     def start(self) -> PhysicsState:
         return rest_state(self._model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, dict[str, jax.Array]]:
         packed = jnp.concatenate([state.qpos, state.qvel, state.warmstart, ctrl.astype(state.qpos.dtype)])
-        flat = host_call(self._target, packed, self._width)
+        flat = host_call(self._target, packed, self.width)
         qpos, qvel, warmstart, *rest = (flat[place].reshape(shape) for place, shape in self._parts)
         out = dict(zip(self._readout, rest, strict=True))
         return PhysicsState(qpos, qvel, warmstart), out | {"overflow": jnp.zeros((), qpos.dtype)}
 
-    def _advance(self, argument: np.ndarray, result: np.ndarray) -> None:
+    def advance(self, argument: np.ndarray, result: np.ndarray) -> None:
         """The host's side: qpos, qvel, warm start and ctrl [..., D] to the state and the readouts [..., E]."""
         if _leaving.is_set():
             raise GivenUp("the interpreter is shutting down")
         _running.append(None)
-        rows, out = argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self._width)
+        rows, out = argument.reshape(-1, argument.shape[-1]), result.reshape(-1, self.width)
         try:
             sound = np.isfinite(rows).all(axis=1)
             out[~sound] = np.nan  # broken before the step
-            self._runner.advance(rows, np.flatnonzero(sound), out)
+            self.runner.advance(rows, np.flatnonzero(sound), out)
         except KeyboardInterrupt:  # XLA runs short programs on the main thread; this cannot unwind through C
             raise GivenUp("interrupted in a physics step (Ctrl-C)") from None
         finally:

@@ -25,9 +25,9 @@ import numpy as np
 
 HostFunction = Callable[[np.ndarray, np.ndarray], None]  # (operand, result to be filled)
 
-_ABI = (0, 3)
+ABI = (0, 3)
 _EXECUTE = 3
-_METADATA = 1
+METADATA = 1
 _INTERNAL = 13
 _DTYPES = {code: np.dtype(name) for code, name in ((4, "int32"), (5, "int64"), (11, "float32"), (12, "float64"))}
 
@@ -37,7 +37,9 @@ def _struct(name: str, *fields: tuple[str, type]) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": [*header, *fields]})
 
 
-class _Buffer(ctypes.Structure):  # XLA_FFI_Buffer
+class Buffer(ctypes.Structure):
+    """XLA_FFI_Buffer: an operand or a result."""
+
     _fields_ = [
         ("struct_size", ctypes.c_size_t),
         ("extension", ctypes.c_void_p),
@@ -49,19 +51,23 @@ class _Buffer(ctypes.Structure):  # XLA_FFI_Buffer
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Its sizes."""
         return tuple(self.dims[: self.rank])
 
 
-class _List(ctypes.Structure):  # XLA_FFI_Args, XLA_FFI_Rets
+class Buffers(ctypes.Structure):
+    """XLA_FFI_Args and XLA_FFI_Rets: all operands or all results."""
+
     _fields_ = [
         ("struct_size", ctypes.c_size_t),
         ("extension", ctypes.c_void_p),
         ("size", ctypes.c_int64),
         ("types", ctypes.c_void_p),
-        ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+        ("items", ctypes.POINTER(ctypes.POINTER(Buffer))),
     ]
 
-    def buffers(self) -> list[_Buffer]:
+    def buffers(self) -> list[Buffer]:
+        """Each of them."""
         return [self.items[k].contents for k in range(self.size)]
 
 
@@ -74,42 +80,46 @@ class Frame(ctypes.Structure):
         ("api", ctypes.c_void_p),
         ("context", ctypes.c_void_p),
         ("stage", ctypes.c_int),
-        ("operands", _List),
-        ("results", _List),
+        ("operands", Buffers),
+        ("results", Buffers),
     ]
 
 
-_Version = _struct("XLA_FFI_Api_Version", ("major", ctypes.c_int), ("minor", ctypes.c_int))
-_Error = _struct("XLA_FFI_Error_Create_Args", ("message", ctypes.c_char_p), ("code", ctypes.c_int))
+Version = _struct("XLA_FFI_Api_Version", ("major", ctypes.c_int), ("minor", ctypes.c_int))
+ErrorArguments = _struct("XLA_FFI_Error_Create_Args", ("message", ctypes.c_char_p), ("code", ctypes.c_int))
 _Stream = _struct("XLA_FFI_Stream_Get_Args", ("context", ctypes.c_void_p), ("stream", ctypes.c_void_p))
-_Api = _struct(
+Api = _struct(
     "XLA_FFI_Api",
-    ("version", _Version),
+    ("version", Version),
     ("internal", ctypes.c_void_p),
     *((name, ctypes.c_void_p) for name in ("create_error", "error_message", "destroy_error", "register", "get_stream")),
 )
 
 
-class _Metadata(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32)]
+class Metadata(ctypes.Structure):
+    """XLA_FFI_Metadata: the version of the ABI that a handler answers in."""
+
+    _fields_ = [("struct_size", ctypes.c_size_t), ("version", Version), ("traits", ctypes.c_uint32)]
 
 
-class _Extension(ctypes.Structure):
+class Extension(ctypes.Structure):
+    """XLA_FFI_Metadata_Extension: how XLA asks a handler for its metadata."""
+
     _fields_ = [
         ("struct_size", ctypes.c_size_t),
         ("type", ctypes.c_int),
         ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),
+        ("metadata", ctypes.POINTER(Metadata)),
     ]
 
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(Frame))
 _Entry = ctypes.PYFUNCTYPE(None, ctypes.POINTER(Frame))
-_CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Error))
+_CreateError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(ErrorArguments))
 _GetStream = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Stream))
 
 _names = itertools.count()
-_alive: list[Any] = []  # XLA keeps the addresses for the life of the process
+handlers: list[Any] = []  # XLA keeps the addresses for the life of the process
 _arrived: set[int] = set()  # threads that got from XLA into Python
 
 
@@ -139,7 +149,7 @@ def register_handler(function: Callable[[Frame], None], platform: str) -> str:
                 raise GivenUp("interrupted (Ctrl-C)")
             _arrived.discard(threading.get_ident())
             frame = arguments[0].contents
-            if not (frame.extension and _describe(frame.extension)) and frame.stage == _EXECUTE:
+            if not (frame.extension and describe(frame.extension)) and frame.stage == _EXECUTE:
                 function(frame)
             return None
         except BaseException as error:
@@ -152,7 +162,7 @@ def register_handler(function: Callable[[Frame], None], platform: str) -> str:
     entry.errcheck = handle  # pyright: ignore[reportAttributeAccessIssue]
     handler = _Handler(entry)
     name = f"pmt_host_call_{next(_names)}"
-    _alive.append(handler)
+    handlers.append(handler)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform=platform)
     return name
 
@@ -160,7 +170,7 @@ def register_handler(function: Callable[[Frame], None], platform: str) -> str:
 def stream_of(frame: Frame) -> int:
     """The CUDA stream that a program on a GPU calls from."""
     arguments = _Stream(ctypes.sizeof(_Stream), None, frame.context, None)
-    failed = _GetStream(_Api.from_address(frame.api).get_stream)(ctypes.byref(arguments))
+    failed = _GetStream(Api.from_address(frame.api).get_stream)(ctypes.byref(arguments))
     if failed:
         raise RuntimeError("XLA gives no stream")
     return arguments.stream or 0
@@ -172,18 +182,18 @@ def host_call(name: str, operand: jax.Array, width: int) -> jax.Array:
     return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(operand)
 
 
-def _describe(extension_address: int) -> bool:
+def describe(extension_address: int) -> bool:
     """Reports the ABI version to XLA; False if XLA did not query it."""
-    extension = _Extension.from_address(extension_address)
-    if extension.type != _METADATA:
+    extension = Extension.from_address(extension_address)
+    if extension.type != METADATA:
         return False
     version = extension.metadata.contents.version
-    version.major, version.minor = _ABI
+    version.major, version.minor = ABI
     extension.metadata.contents.traits = 0
     return True
 
 
-def _array(buffers: _List) -> np.ndarray:
+def _array(buffers: Buffers) -> np.ndarray:
     """The first of XLA's buffers as an array that shares its memory."""
     buffer = buffers.buffers()[0]
     shape, dtype = buffer.shape, _DTYPES[buffer.dtype]
@@ -198,5 +208,5 @@ def _error(api_address: int, error: BaseException) -> int | None:
     if isinstance(error, Exception) and not isinstance(error, GivenUp):
         traceback.print_exception(error)
     message = f"{type(error).__name__}: {error}".encode(errors="replace")
-    arguments = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
-    return _CreateError(_Api.from_address(api_address).create_error)(ctypes.byref(arguments))
+    arguments = ErrorArguments(ctypes.sizeof(ErrorArguments), None, message, _INTERNAL)
+    return _CreateError(Api.from_address(api_address).create_error)(ctypes.byref(arguments))

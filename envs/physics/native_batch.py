@@ -23,7 +23,7 @@ class BatchSteps:
     """Control steps of any number of environments, one `Batch` for each size of batch."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int, forward: bool = False):
-        self._model, self._substeps, self._readout, self._threads = model, substeps, readout, threads
+        self._model, self._substeps, self._readout, self.threads = model, substeps, readout, threads
         self._stage = int(mujoco.mjtStage.mjSTAGE_ACC if forward else mujoco.mjtStage.mjSTAGE_NONE)
         self.forget()
         _all.add(self)
@@ -39,7 +39,7 @@ class BatchSteps:
         try:
             simulations = idle.pop()
         except IndexError:
-            batch = Batch(self._model, len(rows), min(self._threads, len(rows)))
+            batch = Batch(self._model, len(rows), min(self.threads, len(rows)))
             self.made.append(batch)
             simulations = _Simulations(batch, self._readout)
         simulations.advance(rows, todo, out, self._substeps, self._stage)

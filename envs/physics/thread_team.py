@@ -25,7 +25,7 @@ class TeamSteps:
     """Control steps of any number of environments, one mjData a thread."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int, readout: Readout, threads: int, forward: bool = False):
-        self._model, self._substeps, self._readout, self._threads = model, substeps, readout, threads
+        self._model, self._substeps, self._readout, self.threads = model, substeps, readout, threads
         self._forward = forward
         self._idle: list[_Worker] = []  # as many as ever worked at once
 
@@ -33,7 +33,7 @@ class TeamSteps:
         """Writes into `out` [B, E] what a control step makes of the rows `todo` of `rows` [B, D]."""
         # The threads draw rows from one iterator (atomic in CPython), so none waits for a slow one.
         queue, states = iter(todo.tolist()), rows.astype(np.float64)
-        _team.share(lambda: self._work(queue, states, out), queue, min(self._threads, len(todo)))
+        _team.share(lambda: self._work(queue, states, out), queue, min(self.threads, len(todo)))
 
     def _work(self, queue: Iterator[int], states: np.ndarray, out: np.ndarray) -> None:
         try:
@@ -90,7 +90,7 @@ class _Worker:
             raise MemoryError(NO_ROOM)
 
 
-class _Team:
+class Team:
     """Threads that help whichever engine calls; they start when first needed and then wait for work.
 
     `concurrent.futures` costs 16 ants 3 % of their speed. The threads are daemons, which the interpreter does not join
@@ -161,7 +161,7 @@ def _serve(jobs: SimpleQueue[Callable[[], None]]) -> None:
         jobs.get()()
 
 
-_team = _Team()
+_team = Team()
 
 
 def forget_threads() -> None:

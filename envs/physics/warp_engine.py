@@ -26,7 +26,7 @@ class WarpEngine(Remade):
 
     MJX would make a foreign call of every substep and hand all of MuJoCo's arrays from one to the next. Here these
     arrays stay in Warp, and XLA sees the state, the controls and the readouts. Sums are atomic: runs do not repeat to
-    the last bit. Buffers are sized by the model (`_room`) and the batch, and every step reports whether they sufficed.
+    the last bit. Buffers are sized by the model (`room`) and the batch, and every step reports whether they sufficed.
     """
 
     name = "warp"
@@ -38,7 +38,7 @@ class WarpEngine(Remade):
 
         warp_contacts.install()
         self._c_model, self._substeps, self._readout = model, substeps, dict(readout)
-        self._contacts, self._rows = _room(model, contacts)
+        self._contacts, self._rows = room(model, contacts)
         self._held: dict[tuple[str, int], tuple[Any, Any]] = {}  # Warp's model and data, by device and batch
         self._call: Any = None
         self._stepping = threading.Lock()  # devices may call at once, and the CPU's share their data
@@ -169,7 +169,7 @@ _MOST_CONTACTS = 64  # of one world; 30 were enough for the ant, 60 for two hand
 _LOST = 0b11111  # MuJoCo-Warp's overflow bits that cost contacts or constraints; the others are of solvers and sensors
 
 
-def _room(model: mujoco.MjModel, contacts: int | None = None) -> tuple[int, int]:
+def room(model: mujoco.MjModel, contacts: int | None = None) -> tuple[int, int]:
     """Contacts and constraint rows that one world of the model needs at most, for so many contacts if given."""
     first, second = np.triu_indices(model.ngeom, 1)
     wanted = (model.geom_contype[first] & model.geom_conaffinity[second]) | (

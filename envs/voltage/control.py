@@ -262,7 +262,7 @@ class VoltageControl:
             row, next_key = self._load_row(start_row + self._first_row, carry_key)
             share = jax.random.uniform(q_key, (self.num_agents,), self._dtype, -1.0, 1.0)
             q = share * self.scenario.action_scale * self.q_limit(row)
-            return self._solve_first(start_row, q, row, next_key)
+            return self.solve_first(start_row, q, row, next_key)
 
         def unsolved(c: tuple[jax.Array, Carry]) -> jax.Array:
             return (c[0] <= MAX_RESETS) & ~jnp.isfinite(c[1].line_loss_mw)
@@ -317,14 +317,14 @@ class VoltageControl:
             raise TaskError(f"restore takes no '{unknown[0]}'; known: {', '.join(Carry.__dataclass_fields__)}")
         if rest:
             key = jax.random.key(0) if key is None else key
-            first = self._solve_first(start_row, q, self._data_row(start_row + self._first_row), key)
+            first = self.solve_first(start_row, q, self.data_row(start_row + self._first_row), key)
             given = {k: jnp.asarray(v, getattr(first, k).dtype) for k, v in rest.items() if v is not None}
             return self._observe(dataclasses.replace(first, **given), push="frames" not in given)
         if key is None:
-            row, key = self._data_row(start_row + self._first_row), jax.random.key(0)
+            row, key = self.data_row(start_row + self._first_row), jax.random.key(0)
         else:
             row, key = self._load_row(start_row + self._first_row, key)
-        return self._observe(self._solve_first(start_row, q, row, key))
+        return self._observe(self.solve_first(start_row, q, row, key))
 
     def raw(self, state: State) -> dict[str, Any]:
         """What `restore` takes."""
@@ -332,7 +332,7 @@ class VoltageControl:
 
     # Data
 
-    def _data_row(self, index: jax.Array) -> jax.Array:
+    def data_row(self, index: jax.Array) -> jax.Array:
         """[n_pv + 2 n_load] the profiles at row `index` [], interpolated between knots, without noise."""
         per_knot = self.profiles.rows_per_knot
         if per_knot == 1:
@@ -343,7 +343,7 @@ class VoltageControl:
 
     def _load_row(self, index: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The row with MAPDN's noise, which only ever adds, and the key for the next."""
-        row = self._data_row(index)
+        row = self.data_row(index)
         if not self.noise:
             return row, key
         key, noise_key = jax.random.split(key)
@@ -398,7 +398,7 @@ class VoltageControl:
         slack = network.slack
         return flow, p_bus.at[slack].set(-flow.slack_mw), q_bus.at[slack].set(-flow.slack_mvar)
 
-    def _solve_first(self, start_row: jax.Array, q: jax.Array, row: jax.Array, key: jax.Array) -> Carry:
+    def solve_first(self, start_row: jax.Array, q: jax.Array, row: jax.Array, key: jax.Array) -> Carry:
         """The carry after a reset: `row` solved with `q`, and about to be used again."""
         flow, p_bus, q_bus = self._solve(row, q)
         if not self._first_row:  # plain timing: the next flow is already the next row's

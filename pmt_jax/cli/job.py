@@ -15,7 +15,7 @@ from ..trust import trusting
 from .process import answer
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """Standard input ends when whoever started this process is gone, even by kill -9: save and end then."""
     sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)
@@ -23,7 +23,7 @@ def _end_with_parent() -> None:
 
 def main() -> int:
     """Trains the program of the arguments."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     folder, out, cache, given = sys.argv[1:]
 
     def train() -> int:

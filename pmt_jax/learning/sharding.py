@@ -133,7 +133,7 @@ def in_parallel(*parts: functools.partial[Any]) -> tuple[Any, ...]:
     faster than its devices exchange their shares of it. Other devices share the rows of every part.
     """
     devices = 1 if single_device() else jax.sharding.get_abstract_mesh().shape[ENV]
-    if devices == 1 or not _takes_whole_parts():
+    if devices == 1 or not takes_whole_parts():
         return tuple(part() for part in parts)
     leaves, structure = jax.tree.flatten([(part.args, part.keywords) for part in parts])
 
@@ -156,7 +156,8 @@ def in_parallel(*parts: functools.partial[Any]) -> tuple[Any, ...]:
     return jax.shard_map(of_device, in_specs=P(), out_specs=P(), check_vma=False)(*arrays)
 
 
-def _takes_whole_parts() -> bool:
+def takes_whole_parts() -> bool:
+    """Whether each device takes whole parts of `in_parallel`, as those of a CPU do."""
     return jax.default_backend() == "cpu"
 
 

@@ -43,7 +43,7 @@ def report(
         raise UsageError(f"cannot write {out}: the ending of a report must be .html")
     logs = read_all(folders, say)
     title = _title(logs)
-    body = [*_heading(title, logs), *_or_reason(lambda: _table(logs)), *_curve_sections(plot.pooled(logs, say))]
+    body = [*_heading(title, logs), *_or_reason(lambda: scores(logs)), *_curve_sections(plot.pooled(logs, say))]
     for log in logs:
         say(f"evaluating {log.folder} ...")
         body += _run_section(log, episodes)
@@ -62,7 +62,7 @@ def _heading(title: str, logs: Sequence[RunLog]) -> list[str]:
     return [f"<h1>{html.escape(title)}</h1>", f"<p>{many} Made by pmt report.</p>"]
 
 
-def _table(logs: Sequence[RunLog]) -> list[str]:
+def scores(logs: Sequence[RunLog]) -> list[str]:
     """The table that `pmt table` prints of the runs."""
     head, lines, notes = table.cells(rows(logs, note=lambda _: None))
     first = [head.index(name) for name in FIRST]

@@ -57,10 +57,8 @@ class Programs(NamedTuple):
 
 def cache_folder() -> pathlib.Path:
     """Where compiled programs are kept between starts, unless JAX is set to another place."""
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
-    # By the XDG standard, a path that is empty or relative does not count.
-    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
-    return pathlib.Path(getattr(jax.config, "jax_compilation_cache_dir", None) or home / "pmt-jax")
+    chosen = getattr(jax.config, "jax_compilation_cache_dir", None)
+    return pathlib.Path(chosen or tasks.native().cache_of_user())
 
 
 def use_cache() -> None:
@@ -135,7 +133,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
     config = setup.config
     hyper, keys, axes = setup.vmap_arguments
     init = _over_seeds(setup, functools.partial(learner.init, setup), axes)
-    placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys))
+    placement = sharding.placement(setup.mesh, jax.eval_shape(init, hyper, keys)) if setup.mesh else None
     everywhere = sharding.replicated(setup.mesh)
     state = jax.jit(init, out_shardings=placement).lower(hyper, keys).compile(xla_options(once=True))(hyper, keys)
 

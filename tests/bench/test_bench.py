@@ -23,7 +23,7 @@ import envs
 from bench import compare, measure, once, plain, records, render, runner, update
 from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
-from bench.tables import pages, runs, speed, values
+from bench.tables import pages, runs, speed, study, values
 from docs.figures import ant_paths, curves, episode_cost, style
 from pmt_jax.config.settings import FIELDS
 from pmt_jax.errors import UsageError
@@ -193,7 +193,7 @@ def test_an_engine_that_cannot_run_here_is_left_out_with_a_sentence(monkeypatch:
     assert said[0].startswith("left out: environment, a, warp, ") and "physics 'warp' needs an NVIDIA GPU" in said[0]
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_certificates_are_of_the_episodes_that_policies_are_evaluated_in():
     env: Any = envs.make("voltage_33")
     rows = once.data_rows("voltage_33", 2)
@@ -654,3 +654,66 @@ def test_a_gradient_step_is_timed_by_part():
         row = update.update(case)
         assert row["minibatch"] > 0 and row["step_seconds"] > 0
         assert {"gather_seconds", "forward_seconds", "backward_seconds", "adam_seconds"} <= row.keys()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The study's tables
+
+
+def run_of_three_seeds(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
+    """A run of three seeds and ten points whose true episode cost is constant."""
+    points, seeds = 10, len(true_cost)
+    config = {"cost_seen": seen, "lambda_init": 2.0, "method": method} | settings
+    curve = {name: [[1.0] * points] * seeds for name in ("episode_reward", "episode_cost", "violation_rate", "lambda")}
+    return {
+        "steps": list(range(10, 110, 10)),
+        "seeds": list(range(seeds)),
+        **curve,
+        "episode_length": [[1.0] * points] * seeds,
+        "true_episode_cost": [[x] * points for x in true_cost],
+        "true_step_cost": [[x / 100] * points for x in true_cost],
+        "table": {
+            "reward": [1.0] * seeds,
+            "cost": [1.0] * seeds,
+            "true cost": true_cost,
+            "true cost per 1,000 steps while training": [10 * x for x in true_cost],
+        },
+        "source": "training",
+        "task": "lane",
+        "method": method,
+        "cost_limit": 5.0 * seen,
+        "seconds": 1.0,
+        "config": "\n".join(f"{k} = {json.dumps(v)}" for k, v in config.items()),
+    }
+
+
+def test_a_probe_compares_fear_with_the_same_settings_and_corrects_over_all_measures(tmp_path: pathlib.Path):
+    """The tables of README and study that are read at their ends: three measures, one family of tests a file."""
+    low, high = list(np.linspace(1, 2, 12)), list(np.linspace(8, 9, 12))
+    usual = {"cost_value_clip": np.nan, "max_grad_norm": 10.0, "lambda_rule": "integral"}
+    pid = {"cost_value_clip": np.inf, "max_grad_norm": np.inf, "lambda_rule": "pid"}
+
+    def cell(method: str, costs: list[float], recipe: dict) -> dict:
+        run = run_of_three_seeds(method, 0.5, costs)
+        run["config"] += "\n" + "\n".join(
+            f"{k} = {json.dumps(v).lower().replace('infinity', 'inf')}" for k, v in recipe.items()
+        )
+        return run
+
+    file = tmp_path / "x.json"
+    every = [cell("f4sg", low, usual), cell("mappo_l", high, usual), cell("f4sg", low, pid), cell("mappo_l", low, pid)]
+    file.write_text(json.dumps([*every, cell("mappo_l", high, usual | {"cost_value_clip": np.inf})]))
+    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in study.as_probe(file).splitlines()[2:]]
+    assert [row[2] for row in rows] == [
+        "MAPPO-L, as in the study",
+        "F4SG, as in the study",
+        "MAPPO-L, `cost_value_clip` inf",
+        "MAPPO-L, PID for tight limits",
+        "F4SG, PID for tight limits",
+    ]
+    assert all(row[:2] == ["0.5", "5"] for row in rows)
+    single = study.u_test(low, high)
+    six = study.holm([single, single, 1.0, 1.0, 1.0, 1.0])[0]  # two pairs, three measures each
+    assert rows[1][-1] == f"{study.p_value(six)}, {study.p_value(six)}, 1" and rows[4][-1] == "1, 1, 1"
+    assert [row[-2] for row in rows] == ["12 of 12", "0 of 12", "12 of 12", "0 of 12", "0 of 12"]
+    assert [row[-1] for row in rows if "MAPPO-L" in row[2]] == ["-"] * 3

@@ -57,7 +57,13 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"--steps 80:220:4", "--steps 80:88:4"),
     (r"--deterministic --size", "--deterministic --steps 0:9 --size"),
     (r"--method r4sg", "--method f4sg"),
+    # Where flags matter and not the robot, which README, train.md and gpu.md train.
     (r"train ant_2x4(.*) --eval-interval", r"train lane\1 --eval-interval"),
+    (r"train paper/ant_2x4 (.*--cost-limit)", r"train lane \1"),
+    (r"train ant_2x4 (.*runs/ant$)", r"train lane \1"),
+    (r"train paper/ant_2x4 --method f4sg$", "train paper/ant_2x4 --method mappo"),
+    (r"train velocity_ant_2x4", "train lane"),
+    (r"eval runs/x --physics", "eval hub:ant_2x4/mappo_l --physics"),
     (r"method=mappo_l,f4sg,r4sg", "method=f4sg"),
     (r"sweep study\.toml (.*--part)", r"sweep lane --set clip=0.1,0.2 --method mappo \1"),
     (r"\[64,64\],\[128,128\]", "[32,32]"),
@@ -79,8 +85,8 @@ _RUN = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in BUDGET.
 SIZES = {"train": f"--method f4sg {_RUN}", "sweep": _RUN, "eval": "--episodes 2", "report": "--episodes 2"}
 
 # The runs that a page speaks of and does not make.
-_ANT = "pmt train ant_2x4 --method f4sg --out runs/x"
-GIVEN = {"evaluate": _ANT, "render": _ANT, "export": "pmt train lane --out runs/lane"}
+GIVEN = {name: "pmt train lane --method f4sg --out runs/x" for name in ("evaluate", "render")}
+GIVEN["export"] = "pmt train lane --out runs/lane"
 
 
 def commands(block: str) -> Iterator[str]:

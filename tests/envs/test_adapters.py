@@ -244,8 +244,13 @@ def test_gymnasium_keeps_what_its_checker_checks(mode: str):
     check_vector(lambda: adapters.to_gymnasium(Fragile(), 2, autoreset_mode=mode))
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("task", ["noisy", "switch", "ant_2x4", "velocity_hopper_3x1", "voltage_33"])
+@pytest.mark.parametrize(
+    "task",
+    [
+        *(pytest.param(x, marks=pytest.mark.full) for x in ("noisy", "switch", "ant_2x4", "velocity_hopper_3x1")),
+        pytest.param("voltage_33", marks=pytest.mark.slow),  # whose power flow compiles eight times
+    ],
+)
 def test_other_libraries_checkers_accept_the_tasks(task: str):
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 

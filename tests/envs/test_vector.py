@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 import envs
 from envs.base import Env
 from envs.toys import Lane
-from envs.vector import VectorEnv
+from envs.vector import VectorEnv, VectorState
 
 
 class Fragile(Lane):
@@ -108,34 +109,45 @@ def test_a_time_limit_that_terminates_leaves_nothing_to_bootstrap_from():
     outcomes = []
     for limit_terminates in (False, True):
         vector = VectorEnv(env, 2, horizon=2, limit_terminates=limit_terminates)
-        state = vector.reset(jax.random.key(0))
+        state, step = vector.reset(jax.random.key(0)), jax.jit(vector.step)
         for _ in range(2):
-            state, outcome = vector.step(state, jnp.zeros((2, 2, 2)))
+            state, outcome = step(state, jnp.zeros((2, 2, 2)))
         assert (state.episode == 1).all()
         outcomes.append((outcome.terminated.tolist(), outcome.truncated.tolist()))
     assert outcomes == [([False] * 2, [True] * 2), ([True] * 2, [False] * 2)]
+
+
+@functools.cache
+def side_by_side(resets_all: bool):
+    """For two batches of 150: reset, step, and from what a step started all new starts and all plain steps."""
+    vector = VectorEnv(Fragile(), 150)
+    vector.resets_all = resets_all
+
+    def alternatives(start: VectorState, episode: jax.Array, action: jax.Array):
+        keys = jax.vmap(jax.vmap(jax.random.fold_in))(start.key, episode)
+        return jax.vmap(jax.vmap(vector.env.reset))(keys), jax.vmap(jax.vmap(vector.env.step))(start.env, action)
+
+    return jax.jit(jax.vmap(vector.reset)), jax.jit(jax.vmap(vector.step)), jax.jit(alternatives)
 
 
 @pytest.mark.parametrize("resets_all", [False, True])
 @pytest.mark.parametrize("ends", [0, 1, 16, 17, 150])
 def test_those_that_end_start_anew_however_many_and_no_others(ends: int, resets_all: bool):
     """Two batches of 150 side by side, one without an end; a CPU resets 16 at a time."""
-    vector = VectorEnv(Fragile(), 150)
-    vector.resets_all = resets_all
+    reset, step, alternatives = side_by_side(resets_all)
     ended = np.isin(np.arange(150), np.random.default_rng(ends).permutation(150)[:ends])
-    action = jnp.where(
-        jnp.stack([jnp.asarray(ended), jnp.zeros(150, bool)])[..., None, None], -1.0, jnp.full((2, 2), 0.5)
-    )
-    start = jax.vmap(vector.reset)(jax.random.split(jax.random.key(0)))
-    after, outcome = jax.jit(jax.vmap(vector.step))(start, action)
+    action = np.full((2, 150, 2, 2), 0.5, np.float32)
+    action[0, ended] = -1.0
+    start = reset(jax.random.split(jax.random.key(0)))
+    after, outcome = step(start, action)
     np.testing.assert_array_equal(outcome.terminated, [ended, np.zeros(150)])
     np.testing.assert_array_equal(after.episode, [ended, np.zeros(150)])
     np.testing.assert_array_equal(after.elapsed, [~ended, np.ones(150)])
-    keys = jax.vmap(jax.vmap(jax.random.fold_in))(start.key, after.episode)
-    fresh, moved = jax.vmap(jax.vmap(vector.env.reset))(keys), jax.vmap(jax.vmap(vector.env.step))(start.env, action)
+    fresh, moved = alternatives(start, after.episode, action)
     for found, new, old in zip(*(jax.tree.leaves(x) for x in (after.env, fresh, moved)), strict=True):
         if jnp.issubdtype(found.dtype, jax.dtypes.prng_key):
             found, new, old = (jax.random.key_data(x) for x in (found, new, old))
+        found, new, old = map(np.asarray, (found, new, old))
         np.testing.assert_array_equal(found[0, ended], new[0, ended])
         np.testing.assert_array_equal(found[0, ~ended], old[0, ~ended])
         np.testing.assert_array_equal(found[1], old[1])

@@ -28,6 +28,7 @@ def test_a_multiplier_that_is_zero_for_ever_makes_mappo_l_happo():
     chex.assert_trees_all_equal(weights(lagrangian), weights(trained("happo")[0]))
 
 
+@pytest.mark.full
 def test_a_penalty_of_weight_zero_makes_p3o_happo():
     chex.assert_trees_all_close(weights(trained("p3o", lambda_max=0.0)[0]), weights(trained("happo")[0]), atol=1e-6)
     assert differ(weights(trained("p3o")[0])["actor"], weights(trained("happo")[0])["actor"])

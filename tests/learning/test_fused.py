@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from envs import native
 from native import compiled
-from pmt_jax import METHODS, load_config, tasks
+from pmt_jax import load_config, tasks
 from pmt_jax.learning import fused, learner
 from pmt_jax.learning.networks import MLP
 from pmt_jax.learning.optimise import fit, init_train_state
@@ -57,7 +57,7 @@ def assert_close(found, expected, tolerance=2e-5):
 
 
 @pytest.mark.full  # each shape compiles for seconds
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.integers(1, 40),
     st.lists(st.integers(1, 150), min_size=0, max_size=3),
@@ -140,11 +140,14 @@ def learned(state):
     return [np.asarray(x) for x in jax.tree.leaves(parts)]
 
 
+# One actor or one each, critics of states or of observations, epochs or a trust region, fear and regret or neither:
+# what else methods differ in computes with these networks' results.
+NETWORKS = [("lane", "mappo"), ("lane", "ippo_l"), ("lane", "mixed"), ("ant_2x4", "macpo")]
+
+
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("task", "method"), [*(("lane", method) for method in METHODS), ("ant_2x4", "mixed"), ("ant_2x4", "macpo")]
-)
-def test_an_update_of_every_method_learns_what_xla_learns(by_xla, task, method):
+@pytest.mark.parametrize(("task", "method"), NETWORKS)
+def test_an_update_learns_what_xla_learns(by_xla, task, method):
     config = load_config(task, method=method, num_envs=8, rollout_length=16, steps=128, log_interval=1)
     train = jax.jit(lambda key: learner.make_train(config)(key))
     expected = by_xla(jax.jit(lambda key: learner.make_train(config)(key)), jax.random.key(0))
@@ -158,7 +161,7 @@ def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeyp
         raise native.NoLibrary("needs a C++ compiler; found none")
 
     monkeypatch.setattr(native, "targets", none)
-    fused._targets.cache_clear()
+    fused.function_names.cache_clear()
     lines = []
     try:
         with tasks.announcing(lines.append):
@@ -167,4 +170,4 @@ def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeyp
         module, params = network(7, (16,), 2)
         fitted(module, params, rows_of(), jax.random.key(0))
     finally:
-        fused._targets.cache_clear()
+        fused.function_names.cache_clear()

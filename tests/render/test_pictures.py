@@ -22,6 +22,9 @@ from pmt_jax import tasks
 from pmt_jax.errors import UsageError
 from pmt_jax.limits import Limits
 from pmt_jax.render import episode, film, gl, network_map, page, report
+from pmt_jax.studies import table
+from pmt_jax.studies.rows import rows
+from pmt_jax.studies.run_log import read_all
 
 
 def still(name: str, raw: dict[str, np.ndarray], cost: list[float], **options: str) -> episode.Episode:
@@ -392,3 +395,19 @@ def test_a_run_is_drawn_from_a_folder_that_cannot_be_written(whole: pathlib.Path
     assert sorted(p for p in copy.rglob("*")) == before
     (data,) = data_of((tmp_path / "x.html").read_text())
     assert data["title"] == "lane, f4sg, seed 0" and data["panels"][2]["name"] == "position"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The scores of a report
+
+
+def test_limit_seeds_within_and_worst_seed_come_first(whole: pathlib.Path):
+    logs = read_all([whole])
+    head, lines, _ = table.cells(rows(logs))
+    _, scores, _ = report.scores(logs)
+    heads = re.findall(r"<th(?: [^>]*)?>(.*?)</th>", scores)
+    assert heads[:5] == ["method", "task", "limit", "seeds within", "worst seed"]
+    assert sorted(heads) == sorted(head) and "mean-action seeds within" in heads
+    cells = [cell.replace("\u00a0", " ") for cell in re.findall(r"<td[^>]*>(.*?)</td>", scores)]
+    assert dict(zip(heads, cells, strict=True)) == dict(zip(head, lines[0], strict=True))
+    assert '<div class="scores">' in scores

@@ -86,7 +86,7 @@ def end(number, _):
     sys.exit(128 + number)
 signal.signal(signal.SIGINT, end)
 signal.signal(signal.SIGTERM, end)
-threading.Thread(target=job._end_with_parent, daemon=True).start()
+threading.Thread(target=job.end_with_parent, daemon=True).start()
 file.write_text("ready")
 while True:
     time.sleep(0.05)

@@ -25,7 +25,7 @@ def finished(out: pathlib.Path) -> list[str]:
     return sorted(p.parent.name for p in out.glob("*/config.toml"))
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_shares_train_their_own_programs_and_the_last_prints_the_table(tmp_path: pathlib.Path, cli):
     out = tmp_path / "out"
     code, text, err = cli(*SWEEP, out, "--part", "2/2")

@@ -8,6 +8,7 @@ import pathlib
 import re
 import shutil
 import signal
+import warnings
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ import tomli_w
 
 from pmt_jax import load_config
 from pmt_jax.errors import UsageError
-from pmt_jax.policies import load
 from pmt_jax.studies import reproduce, run_log, sweep, table
 from pmt_jax.studies.points import Part, make_points
 from pmt_jax.training import checkpoint
@@ -37,7 +37,7 @@ def without_seconds(log: list[dict]) -> list[dict]:
 
 
 def state(folder: pathlib.Path) -> dict[str, np.ndarray]:
-    return checkpoint.pack(load.load_run(folder)[1])
+    return checkpoint.newest(folder, warnings.warn).packed
 
 
 @pytest.fixture(scope="module")

@@ -226,7 +226,10 @@ def test_agents_that_share_costs_have_one_column(task: str):
     assert not [name for name in evaluated if "agent_" in name or name.endswith("_worst")]
 
 
-@pytest.mark.parametrize(("scope", "agents", "costs"), [("network", 1, 1), ("zone", 6, 1), ("regions", 1, 4)])
+SCOPES = [("zone", 6, 1), *(pytest.param(*x, marks=pytest.mark.full) for x in (("network", 1, 1), ("regions", 1, 4)))]
+
+
+@pytest.mark.parametrize(("scope", "agents", "costs"), SCOPES)
 def test_zones_of_a_grid_have_a_column_each(scope: str, agents: int, costs: int):
     config = load_config("voltage_33", method="mappo_l", env=[f"cost_scope={scope}"], num_envs=2, hidden=[8])
     setup = make_setup(config)
@@ -238,7 +241,7 @@ def test_zones_of_a_grid_have_a_column_each(scope: str, agents: int, costs: int)
         assert len(found) == (agents if agents > 1 else costs if costs > 1 else 0)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_zones_of_a_grid_are_judged_one_by_one(tmp_path: pathlib.Path, cli):
     """Two of six zones have costs; their mean over agents is a third of these."""
     out, file, limit = tmp_path / "run", tmp_path / "steps.npz", 12

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from pmt_jax import load_config
 from pmt_jax.training import chunks
-from runs import ARGUMENTS, STEPS, assert_same_run, rows
+from runs import ARGUMENTS, STEPS, TINY, assert_same_run, rows
 
-LONG = (*ARGUMENTS, "--log-interval", 10**6, "--steps", 1400)  # one row, of 14 updates
+LONG = ("lane", *TINY, "--method", "mappo", "--seeds", 2, "--no-cache")
+LONG += ("--log-interval", 10**6, "--steps", 1400)  # one row, of 14 updates
 relaxed = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
@@ -68,6 +69,7 @@ def test_rows_and_states_do_not_depend_on_the_chunks(
     assert_same_run(tmp_path / "run", whole)
 
 
+@pytest.mark.full
 def test_a_run_that_is_stopped_within_a_row_goes_on_with_the_row(tmp_path: pathlib.Path, cli, monkeypatch):
     """Of a row as long as the run, in chunks of 5 updates and, stopped after the second and fourth, of 3."""
     monkeypatch.setattr(chunks, "plan", lambda config, done, _: min(5, 14 - done))

@@ -55,7 +55,7 @@ def train(count, task, **sizes):
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
 if sizes.pop("share_rows"):  # as on GPUs
-    sharding._takes_whole_parts = lambda: False
+    sharding.takes_whole_parts = lambda: False
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
     from envs.physics import contract
     contract.obstacle = lambda name: None

@@ -62,7 +62,7 @@ def test_one_seed_breaks_and_the_other_trains_on(whole: pathlib.Path, tmp_path: 
     for path, x in first.items():
         assert np.isfinite(x).all() or not np.isfinite(second[path]).all()  # an unknown best cost is inf
         assert np.array_equal(x[0], second[path][0])
-    assert first["0.update"].tolist() == [16, 8]
+    assert first["['last'].update"].tolist() == [16, 8]
 
     code, again, _ = cli(*command, "--resume")
     assert code == 1 and "stopped: a weight of seed 1 at step 1,000" in again
@@ -81,7 +81,7 @@ def test_a_worker_that_is_lost_after_a_seed_broke_costs_one_chunk(tmp_path: path
     monkeypatch.setattr(trainer.Trainer, "evaluate", evaluate_until_lost)
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
     assert code == 1 and not err and "stopped: a worker died; saved as of step 600" in text
-    assert saved(tmp_path / "run")["0.update"].tolist() == [6, 2]
+    assert saved(tmp_path / "run")["['last'].update"].tolist() == [6, 2]
 
 
 def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypatch):
@@ -89,7 +89,7 @@ def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypa
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
     assert code == 1 and "seed 0 at step 400" in text and "seed 1 at step 600" in text and "done" not in text
     assert rows(tmp_path / "run")[-1]["step"] == 600
-    assert saved(tmp_path / "run")["0.update"].tolist() == [2, 4]
+    assert saved(tmp_path / "run")["['last'].update"].tolist() == [2, 4]
     # With --debug they go on from there, to be looked at; here by a program without its checks.
     monkeypatch.undo()
     unchecked = trainer.compile_run
@@ -97,7 +97,7 @@ def test_all_seeds_break_and_the_run_stops(tmp_path: pathlib.Path, cli, monkeypa
         trainer, "compile_run", lambda setup, say: unchecked(dataclasses.replace(setup, debug=False), say)
     )
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run", "--resume", "--debug")
-    assert code == 0 and saved(tmp_path / "run")["0.update"].tolist() == [12, 14]
+    assert code == 0 and saved(tmp_path / "run")["['last'].update"].tolist() == [12, 14]
 
 
 def row(**changes: float) -> dict[str, Any]:

@@ -155,7 +155,7 @@ def test_commands_that_read_work_on_what_is_whole(whole: pathlib.Path, harmed: l
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
-@settings(max_examples=25, **(QUIETLY | {"derandomize": False}))
+@settings(max_examples=15, **(QUIETLY | {"derandomize": False}))
 @given(harms, st.booleans())
 def test_both_on_many_more(whole: pathlib.Path, harmed: list, by_file: bool):
     with tempfile.TemporaryDirectory() as place:

@@ -42,6 +42,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.full
 def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happened(
     whole: pathlib.Path, tmp_path: pathlib.Path, cli
 ):

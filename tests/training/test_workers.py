@@ -57,7 +57,7 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
     for each in (process, *psutil.Process(process.pid).children()):
         each.send_signal(signal.SIGTERM)
     text, err = process.communicate(timeout=120)
-    assert process.returncode == 128 + signal.SIGTERM and not err
+    assert (process.returncode, err) == (128 + signal.SIGTERM, "")  # together: an abort says why on stderr
     assert f"--out {tmp_path / 'run'} --resume --workers 2" in text.splitlines()[-1]
     goal = rows(tmp_path / "run")[-1]["step"] + STEPS // 4
     assert cli(*WORKERS, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
@@ -71,7 +71,8 @@ def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: path
     (tmp_path / "run").rename(tmp_path / "elsewhere")
     text, err = process.communicate(timeout=120)
     said, saved = text.splitlines()[-1], tmp_path / "run-rescued"
-    assert process.returncode == 1 and not err and said.startswith(f"stopped: {tmp_path / 'run'} was deleted, renamed")
+    assert (process.returncode, err) == (1, "")
+    assert said.startswith(f"stopped: {tmp_path / 'run'} was deleted, renamed")
     assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --workers 2")
     assert not (tmp_path / "run").exists()
     step = rows(saved)[-1]["step"]
@@ -86,7 +87,7 @@ def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathli
     first, second = psutil.Process(process.pid).children()
     second.kill()
     text, err = process.communicate(timeout=120)
-    assert process.returncode == 1 and not err
+    assert (process.returncode, err) == (1, "")
     said, step = text.splitlines()[-1], rows(tmp_path / "run")[-1]["step"]
     assert said.startswith("stopped: worker 2 of 2 (seed 1) was killed by SIGKILL")
     assert f"saved as of step {step:,}. Continue with: pmt train" in said

@@ -24,7 +24,7 @@ from .model import FIELDS, Tables
 Way = Literal["xla", "host"]
 Step = Callable[..., tuple[jax.Array, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]]
 
-_CALL = "__gpu$xla.gpu.ptx"
+CALL = "__gpu$xla.gpu.ptx"
 _ENTRY = "fused_step"
 
 
@@ -132,7 +132,7 @@ def _lower(context: Any, *operands: Any, kernel: Kernel) -> Any:
         "shared_mem_bytes": number(0),
         "output_indices": ir.ArrayAttr.get([number(len(operands) + k) for k in range(len(kernel.widths))]),
     }
-    return jax.ffi.ffi_lowering(_CALL, backend_config=config, api_version=4)(context, *operands)
+    return jax.ffi.ffi_lowering(CALL, backend_config=config, api_version=4)(context, *operands)
 
 
 mlir.register_lowering(_call, _lower, platform="cuda")  # pyright: ignore[reportArgumentType] (a stricter protocol than JAX keeps)

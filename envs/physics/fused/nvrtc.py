@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Mapping
 
 from ...errors import TaskError
+from ...native import cache_of_user
 
 _FOLDER = pathlib.Path(__file__).parent
 _PARTS = ("smooth", "contacts", "solver", "readouts", "step")
@@ -41,19 +42,13 @@ def step_ptx(tables: str, architecture: str) -> str:
     options = (f"--gpu-architecture=compute_{architecture.replace('.', '')}", *_OPTIONS)
     made_of = [*_version(), source, *options, *(part for item in headers.items() for part in item)]
     key = hashlib.sha256("\0".join(map(str, made_of)).encode()).hexdigest()[:32]
-    kept = _cache() / f"step-{key}.ptx"
+    kept = cache_of_user() / "fused" / f"step-{key}.ptx"
     with contextlib.suppress(OSError, UnicodeDecodeError):
         return kept.read_text()
-    ptx = _compiled(source, headers, options)
+    ptx = compiled(source, headers, options)
     with contextlib.suppress(OSError):  # a home that cannot be written: the next process compiles again
         _put(kept, ptx)
     return ptx
-
-
-def _cache() -> pathlib.Path:
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
-    home = pathlib.Path(chosen) if os.path.isabs(chosen) else pathlib.Path.home() / ".cache"
-    return home / "pmt-jax" / "fused"
 
 
 def _put(path: pathlib.Path, text: str) -> None:
@@ -70,9 +65,13 @@ def _put(path: pathlib.Path, text: str) -> None:
 
 
 @functools.cache
-def _library() -> ctypes.CDLL:
-    """NVRTC; its builtins come first, as it looks for them in no folder of its own."""
-    found = next((folder for folder in _folders() if any(folder.glob("libnvrtc.so*"))), None)
+def library() -> ctypes.CDLL:
+    """NVRTC; its builtins come first, as it looks for them in no folder of its own.
+
+    Raises:
+      TaskError: there is none.
+    """
+    found = next((folder for folder in folders() if any(folder.glob("libnvrtc.so*"))), None)
     try:
         if found is None:
             return ctypes.CDLL("libnvrtc.so")
@@ -83,7 +82,7 @@ def _library() -> ctypes.CDLL:
         raise TaskError(f"needs NVIDIA's run-time compiler; {error}; pip install -U 'jax[cuda13]'") from None
 
 
-def _folders() -> list[pathlib.Path]:
+def folders() -> list[pathlib.Path]:
     """Where NVIDIA's wheels put libraries."""
     spec = importlib.util.find_spec("nvidia")
     roots = [pathlib.Path(root) for root in (spec.submodule_search_locations or ())] if spec else []
@@ -93,7 +92,7 @@ def _folders() -> list[pathlib.Path]:
 def obstacle() -> str | None:
     """Why nothing can be compiled here, as the rest of a sentence; None if it can."""
     try:
-        _library()
+        library()
     except TaskError as error:
         return str(error)
     return None
@@ -102,12 +101,17 @@ def obstacle() -> str | None:
 @functools.cache
 def _version() -> tuple[int, int]:
     major, minor = ctypes.c_int(), ctypes.c_int()
-    _library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+    library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     return major.value, minor.value
 
 
-def _compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...]) -> str:
-    nvrtc, program = _library(), ctypes.c_void_p()
+def compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...]) -> str:
+    """PTX of a source that includes headers, {name: text}.
+
+    Raises:
+      TaskError: NVRTC is missing, does not start or refuses the source.
+    """
+    nvrtc, program = library(), ctypes.c_void_p()
     names, texts = (list_of(part) for part in (headers.keys(), headers.values()))
     created = nvrtc.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"step.cu", len(headers), texts, names)
     if created:
@@ -118,7 +122,7 @@ def _compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...])
             log = _text(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
             first = next((line for line in log.splitlines() if "error" in line), log[:200])
             raise TaskError(f"NVIDIA's run-time compiler {'.'.join(map(str, _version()))} refuses the step: {first}")
-        return _for_older_drivers(_text(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program))
+        return for_older_drivers(_text(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program))
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
 
@@ -137,7 +141,7 @@ def _text(size_of: object, text_of: object, program: ctypes.c_void_p) -> str:
     return buffer.value.decode()
 
 
-def _for_older_drivers(ptx: str) -> str:
+def for_older_drivers(ptx: str) -> str:
     """PTX marked as that of its major version's first release.
 
     Drivers refuse what a newer minor version marked, even where, as here, it uses nothing new. CUDA 13 writes PTX 9.

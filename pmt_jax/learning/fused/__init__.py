@@ -76,11 +76,11 @@ def _wide(width: int) -> int:
 
 def available() -> bool:
     """Whether what is traced now can call the code: on one CPU device, where it compiles."""
-    return jax.default_backend() == "cpu" and sharding.single_device() and _targets() is not None
+    return jax.default_backend() == "cpu" and sharding.single_device() and function_names() is not None
 
 
 @functools.cache
-def _targets() -> list[str] | None:
+def function_names() -> list[str] | None:
     """The functions' names in XLA; None where no compiler makes them."""
     native = tasks.native()
     headers = (HERE / name for name in ("activations.h", "adam.h", "matmul.h", "mlp.h", "passes.h"))
@@ -95,7 +95,7 @@ def _targets() -> list[str] | None:
 
 
 def _call(which: int, results: Sequence[Any], **options: Any) -> Callable[..., Any]:
-    targets = _targets()
+    targets = function_names()
     assert targets is not None
     return jax.ffi.ffi_call(targets[which], results, vmap_method="broadcast_all", **options)
 

@@ -55,7 +55,8 @@ def worst(actual, expected) -> float:
 
 @pytest.fixture(
     scope="session",
-    params=["mujoco", pytest.param("fused", marks=compiled), pytest.param("mjx", marks=pytest.mark.full)],
+    # MJX compiles this ant for a minute; -m full has MJX with the hands and with the robots.
+    params=["mujoco", pytest.param("fused", marks=compiled), pytest.param("mjx", marks=pytest.mark.slow)],
 )
 def replay(request):
     """Recording and our State after one control step from each of its rows."""
@@ -117,7 +118,7 @@ def test_4x2_observations_on_mjx_from_its_2x4_states(replay):
     rows, env = recording("ant_4x2"), envs.make("ant_4x2", physics="mujoco")
     np.testing.assert_array_equal(rows["qpos1"], recording("ant_2x4")["qpos1"])
     physics = after.carry.physics
-    obs = jax.vmap(env.restore)(physics.qpos, physics.qvel).obs
+    obs = jax.jit(jax.vmap(env.restore))(physics.qpos, physics.qvel).obs
     check_obs(rows, obs)
 
 
@@ -167,14 +168,14 @@ def test_model_is_the_original_ant():
 def test_spec_and_observation(name, agents, width):
     env = envs.make(name, physics="mujoco")
     assert env.engine == "mujoco"
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     spec = env.spec
     assert (spec.name, spec.num_agents, spec.obs_dim, spec.action_dim) == (name, agents, width, 8 // agents)
     assert (spec.state_dim, spec.num_costs, spec.horizon, spec.cost_limit) == (29, 1, 1000, 10.0)
     assert state.obs.shape == (agents, width) and state.global_state.shape == (29,)
     np.testing.assert_allclose(state.obs.mean(axis=1), 0, atol=1e-6)
     np.testing.assert_allclose(state.obs.std(axis=1), 1, atol=1e-5)
-    raw = envs.make(name, physics="mujoco", observation="raw").reset(jax.random.key(0))
+    raw = jax.jit(envs.make(name, physics="mujoco", observation="raw").reset)(jax.random.key(0))
     np.testing.assert_array_equal(raw.obs[:, :29], np.broadcast_to(raw.global_state, (agents, 29)))
     np.testing.assert_array_equal(raw.obs[:, 29:], np.eye(agents))
 
@@ -303,9 +304,9 @@ def centre(x: float) -> float:
 @pytest.mark.parametrize(("kind", "costs"), [("reference", [0, 1, 1, 1, 1, 0]), ("costly", [0, 1, 1, 1, 1, 1])])
 def test_an_ant_behind_a_wall_is_outside_and_behind_the_band_reference_walls_cost_nothing(kind, costs):
     env, step = walled(kind)
-    rest = np.asarray(env.raw(env.reset(jax.random.key(0)))["qpos"])
+    rest = np.asarray(env.raw(jax.jit(env.reset)(jax.random.key(0)))["qpos"])
     qpos = np.stack([np.r_[30.0, centre(30.0) + off, rest[2:]] for off in (0.0, -4.5, 4.5, -5.5, 5.5, 9.0)])
-    after = step(jax.vmap(env.restore)(qpos, np.zeros((6, 14))), jnp.zeros((6, 2, 4)))
+    after = step(jax.jit(jax.vmap(env.restore))(qpos, np.zeros((6, 14))), jnp.zeros((6, 2, 4)))
     np.testing.assert_array_equal(after.info["outside"], [0, 0, 0, 1, 1, 1])
     np.testing.assert_array_equal(after.cost[:, 0, 0], costs)
 
@@ -328,12 +329,12 @@ def test_away_from_walls_every_kind_of_wall_is_the_reference(kind):
 
 def thrown(env, speed: float):
     """Ants on every straight of the corridor that fly towards either wall."""
-    rest = np.asarray(env.raw(env.reset(jax.random.key(0)))["qpos"])
+    rest = np.asarray(env.raw(jax.jit(env.reset)(jax.random.key(0)))["qpos"])
     places = [(x, side) for x in (-50.0, 5.0, 19.0, 40.0, 59.0, 75.0, 99.0, 130.0, 400.0) for side in (1, -1)]
     qpos = np.stack([np.r_[x, centre(x) + 2 * side, 0.5, rest[3:]] for x, side in places])
     qvel = np.zeros((len(places), 14))
     qvel[:, 1] = [side * speed for _, side in places]
-    return jax.vmap(env.restore)(qpos, qvel)
+    return jax.jit(jax.vmap(env.restore))(qpos, qvel)
 
 
 @functools.cache

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs import physics
 from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.vector import VectorEnv
@@ -30,6 +31,11 @@ def made(variant: str = "2x6", **options):
 @functools.cache
 def stepper(**options):
     return jax.jit(jax.vmap(made(**options).step))
+
+
+@functools.cache
+def restore():
+    return jax.jit(made().restore)
 
 
 @functools.cache
@@ -131,7 +137,7 @@ def test_observation_layout():
     last_action = np.linspace(-1, 1, 40, dtype=np.float32)
     goal_quat = np.array([0, 1, 0, 0], np.float32)
     force = rng.uniform(-0.4, 0.4, 48).astype(np.float32)
-    state = env.restore(qpos, qvel, goal_quat, last_action, joint_force=force)
+    state = jax.jit(env.restore)(qpos, qvel, goal_quat, last_action, joint_force=force)
     obs, seen = np.asarray(state.obs), np.asarray(state.global_state)
     np.testing.assert_array_equal(seen, np.concatenate([obs[0, :187], obs[1, :187], obs[0, 187:]]))
     np.testing.assert_array_equal(obs[0, 187:], obs[1, 187:])
@@ -189,7 +195,7 @@ def test_4x3_is_2x6_cut_in_halves():
 def test_cost_depends_on_the_action_alone(variant, action, cost):
     env = made(variant)
     given = jnp.clip(joint_action(**action), -1, 1).reshape(-1)
-    np.testing.assert_array_equal(env._get_cost(given), np.full((2, 1), cost))
+    np.testing.assert_array_equal(env.cost_of(given), np.full((2, 1), cost))
 
 
 def test_actions_are_clamped_and_seen_by_the_next_state():
@@ -203,8 +209,8 @@ def test_reward_at_the_goal_is_one_and_falls_as_the_task_says():
     env = made()
 
     def reward(place, turn, goal):
-        carry = env.restore(np.r_[np.zeros(48), place, turn], np.zeros(54), goal, np.zeros(40)).carry
-        return float(env._get_reward(carry))
+        carry = restore()(np.r_[np.zeros(48), place, turn], np.zeros(54), np.asarray(goal), np.zeros(40)).carry
+        return float(env.reward_of(carry))
 
     goal = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     assert reward(hand_over.GOAL, goal, goal) == pytest.approx(1)
@@ -218,7 +224,7 @@ def test_a_fallen_object_ends_the_episode():
 
     def ended(height: float) -> bool:
         qpos = np.r_[np.zeros(48), 0, -0.5, height, 1, 0, 0, 0]
-        return bool(env._get_termination(env.restore(qpos, np.zeros(54), [1, 0, 0, 0], np.zeros(40)).carry.physics))
+        return bool(env.ends(restore()(qpos, np.zeros(54), np.array([1, 0, 0, 0]), np.zeros(40)).carry.physics))
 
     assert (ended(0.1999), ended(0.2001), ended(np.nan)) == (True, False, True)
 
@@ -272,10 +278,11 @@ def test_energy_does_not_grow_with_actions_off():
         assert max(energies) <= energies[0] + 1e-4 and energies[-1] < 0.9 * energies[0]
 
 
+@pytest.mark.full
 def test_fingertips_sense_the_egg_and_not_their_own_weight(holding):
     env = made()
     in_the_air = np.r_[np.full(48, 0.3), 0, -0.4, 9, 1, 0, 0, 0]
-    state = env.restore(in_the_air, np.zeros(54), [1, 0, 0, 0], np.zeros(40))
+    state = restore()(in_the_air, np.zeros(54), np.array([1, 0, 0, 0]), np.zeros(40))
     after = episodes(env, jnp.zeros((60, 1, 2, 20)), jax.tree.map(lambda x: x[None], state))
     assert np.abs(after.obs[-1, 0, :, 137:167]).max() < 0.01
     weight = np.asarray(holding[1].next_obs[-10:, :, 0, 137:167]).reshape(-1, 5, 6)[..., :3]
@@ -284,7 +291,9 @@ def test_fingertips_sense_the_egg_and_not_their_own_weight(holding):
 
 def test_c_engine_reads_the_sensors_that_plain_steps_leave_behind():
     env, state = made(), jax.tree.map(lambda x: x[:4], starts())
-    after, out = jax.vmap(env._engine.step)(state.carry.physics, jnp.zeros((4, 40)))
+    readout = {"sensors": ("sensordata", slice(None))}
+    engine = physics.make_engine(env.model, substeps=hand_over.SUBSTEPS, readout=readout, physics="mujoco")
+    after, out = jax.vmap(engine.step)(state.carry.physics, jnp.zeros((4, 40)))
     data = mujoco.MjData(env.model)
     for i in range(4):
         mujoco.mj_resetData(env.model, data)
@@ -349,7 +358,7 @@ def test_a_thousand_random_steps_break_nothing(physics):
     assert not broken.any()
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_the_egg_can_be_handed_over():
     """Actions found by search (docs/figures/hand_over.py), from the three starts that they were found on."""
     env, found = made(), json.loads(CATCH.read_text())

@@ -134,8 +134,8 @@ def test_reproduces_the_recorded_steps_on_mjx(name):
 @each(default=DEFAULT[:1])
 def test_reproduces_the_recorded_resets(name):
     rows, (env, restore, _, _) = recording(name), made(name, "mujoco")
-    still = np.zeros((len(rows["reset_qpos"]), env._vases.nv + 6 * env._vases.count), np.float32)
-    owner = np.zeros((len(still), env._vases.count), int)
+    still = np.zeros((len(rows["reset_qpos"]), env.vases.nv + 6 * env.vases.count), np.float32)
+    owner = np.zeros((len(still), env.vases.count), int)
     state = restore(rows["reset_qpos"], still, still, rows["reset_goals"], rows["reset_hazards"], owner)
     np.testing.assert_allclose(state.global_state, rows["reset_obs"], atol=2e-4, rtol=2e-5)
 
@@ -176,7 +176,7 @@ def stepped(task, action=0.0, hazard=(1.8, 1.8), qpos=None, qvel=None, owner=0):
       owner: of all vases.
     """
     env, restore, step, _ = task
-    vases = env._vases.count
+    vases = env.vases.count
     boxes = [[0.35 * v - 1.5, 1.6, VASE_HEIGHT, 1, 0, 0, 0] for v in range(vases)]
     places, speeds = np.concatenate([[-1.6, -1.6, 0, 1.6, -1.6, 0], *boxes]), np.zeros(6 + 6 * vases)
     for x, changes in ((places, qpos), (speeds, qvel)):
@@ -258,7 +258,7 @@ def test_observations_are_standardised_over_their_own_entries():
     np.testing.assert_array_equal(raw.obs[0], np.c_[np.tile(raw.global_state[0], (2, 1)), np.eye(2)])
     scoring: Any = envs.make("multi_goal_point_2", physics="mujoco")
     carry, qacc = jax.tree.map(lambda x: x[0], raw.carry), jnp.linspace(-1, 1, 6)
-    (x, y), (scored, state) = (jax.jit(task._get_obs)(carry, qacc) for task in (env, scoring))
+    (x, y), (scored, state) = (jax.jit(task.observe)(carry, qacc) for task in (env, scoring))
     x, y = np.asarray(x, float), np.asarray(y, float)
     np.testing.assert_allclose(scored, (x - x.mean(1, keepdims=True)) / x.std(1, keepdims=True), atol=1e-5)
     np.testing.assert_allclose(state, (y - y.mean()) / y.std(), atol=1e-5)
@@ -349,12 +349,13 @@ def test_what_mujoco_calls_a_contact_of_ants_is_what_counts():
 
 def test_ants_end_on_their_backs_and_points_never():
     env: Any = envs.make("multi_goal_ant_0", physics="mujoco")
-    assert env._ends(env._at_rest.start()).tolist() is True  # all at z = 0
-    high = env._at_rest.start().qpos.at[jnp.array([2, 17])].set(0.081)
+    flat = jnp.zeros(30)  # both ants' torsos at z = 0
+    assert env.ends(PhysicsState(flat, jnp.zeros(28), jnp.zeros(28))).tolist() is True
+    high = flat.at[jnp.array([2, 17])].set(0.081)
     for low, ends in ((0.081, False), (0.08, True), (0.05, True)):
         physics = PhysicsState(high.at[17].set(low), jnp.zeros(28), jnp.zeros(28))
-        assert bool(env._ends(physics)) is ends
-    assert not envs.make("multi_goal_point_0", physics="mujoco")._ends(None)
+        assert bool(env.ends(physics)) is ends
+    assert not envs.make("multi_goal_point_0", physics="mujoco").ends(None)
 
 
 @pytest.mark.parametrize(

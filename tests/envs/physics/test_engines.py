@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 import pytest
 
-import envs
 from batches import assert_batches_agree, assert_same
 from envs import physics
 from envs.ant import corridor, walls
@@ -163,7 +162,7 @@ def test_two_programs_at_once_share_the_threads(readout):
 
 
 def test_team_does_each_piece_once_and_leaves_nobody_behind():
-    team = thread_team._Team()
+    team = thread_team.Team()
     for threads in (1, 2, 5):
         queue, taken, at_work = iter(range(50)), [], []
 
@@ -179,7 +178,7 @@ def test_team_does_each_piece_once_and_leaves_nobody_behind():
 
 
 def test_calls_at_the_same_time_have_helpers_of_their_own():
-    team, everyone, done = thread_team._Team(), threading.Barrier(4), []
+    team, everyone, done = thread_team.Team(), threading.Barrier(4), []
 
     def call():
         team.share(lambda: done.append(everyone.wait(60)), iter(()), 2)  # nobody passes before all four are there
@@ -194,14 +193,14 @@ def test_calls_at_the_same_time_have_helpers_of_their_own():
 
 @pytest.mark.parametrize("devices", [1, 3, 16])
 def test_devices_share_the_threads(devices: int, monkeypatch: pytest.MonkeyPatch):
-    engine = envs.make("velocity_half_cheetah_2x3", physics="mujoco", threads=8)._engine
+    shared = engine(PLAIN, threads=8)
     monkeypatch.setattr(jax, "local_device_count", lambda: devices)
-    assert engine._runner._threads == {1: 8, 3: 3, 16: 1}[devices]
+    assert shared.runner.threads == {1: 8, 3: 3, 16: 1}[devices]
 
 
 @pytest.mark.parametrize("guilty", ["the caller", "a helper"])
 def test_team_passes_errors_on_and_stops(guilty):
-    team, queue, caller, taken = thread_team._Team(), iter(range(1000)), threading.get_ident(), []
+    team, queue, caller, taken = thread_team.Team(), iter(range(1000)), threading.get_ident(), []
 
     def work():
         for piece in queue:
@@ -261,9 +260,9 @@ def test_forked_child_has_its_own_threads():
         engines = [physics.make_engine(corridor.model(), readout=readout, **options) for readout in readouts]
         rows = np.tile(np.concatenate([corridor.model().qpos0, np.zeros(36)]), (16, 1)).astype(np.float32)
         def advance():
-            out = [np.zeros((16, engine._width), np.float32) for engine in engines]
+            out = [np.zeros((16, engine.width), np.float32) for engine in engines]
             for engine, result in zip(engines, out):
-                engine._advance(rows, result)
+                engine.advance(rows, result)
             return np.concatenate(out, axis=1)
         ours = advance()
         child = os.fork()
@@ -417,7 +416,7 @@ def test_on_a_gpu_warp_takes_what_fused_cannot_step(monkeypatch):
 
 
 def test_room_for_contacts_in_warp():
-    assert warp_engine._room(corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
+    assert warp_engine.room(corridor.model()) == (25, 108)  # 13 pairs with the floor; 8 limits
 
 
 def test_flattened_turns_any_vmap_into_one_batch():

@@ -427,8 +427,8 @@ def fresh(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(native, "_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(native, "_failures", {})
+    monkeypatch.setattr(native, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(native, "failures", {})
     return tmp_path / "bin"
 
 
@@ -436,7 +436,7 @@ def small_code(*bodies: str) -> native.Code:
     return cpu.code(header(tables_of.tables(small(*bodies), 1, {})))
 
 
-def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli):
+def test_without_a_compiler_mujoco_steps_and_one_sentence_says_what_is_gained(fresh, cli, quick_doctor):
     env = envs.make("ant_2x4")
     assert env.engine == "mujoco" and physics.resolve("auto") == "mujoco"
     assert "'fused' steps this model" in tasks.advice(env) and "found none (install g++" in tasks.advice(env)
@@ -460,16 +460,26 @@ def test_compilers_are_asked_in_the_order_of_the_readme(fresh, monkeypatch):
     assert [compiler.version for compiler in native.compilers()] == 4 * ["fake 1.0"] + ["clang of zig"]
 
 
+def test_flags_of_the_chosen_compiler_have_the_last_word(small_library, fresh, monkeypatch):
+    told = fresh.parent / "told"
+    says = 'case "$*" in *--version) echo "fake 1.0"; exit 0;; esac\n'
+    mine = script(fresh, "mine", says + f'echo "$@" > {told}\n' + COPYING.format(small_library))
+    monkeypatch.setenv("CXX", f"{mine} -O1")
+    native.library(small_code())
+    words = told.read_text().split()
+    assert words.index("-O3") < words.index("-O1")
+
+
 @pytest.mark.parametrize("text", [FAILING, GARBLING, HANGING], ids=["fails", "writes garbage", "hangs"])
 def test_compilers_that_do_not_work_end_in_mujoco_and_a_sentence(fresh, text, monkeypatch):
-    monkeypatch.setattr(native, "_PATIENCE", 60.0 if text != HANGING else 0.2)
+    monkeypatch.setattr(native, "PATIENCE", 60.0 if text != HANGING else 0.2)
     script(fresh, "c++", text)
     env = envs.make("ant_2x4")
     assert env.engine == "mujoco"
     assert "could not be compiled" in tasks.advice(env) and "c++" in tasks.advice(env)
     with pytest.raises(TaskError, match="physics 'fused' could not be compiled"):
         envs.make("ant_2x4", physics="fused")
-    assert not list(native._folder().iterdir()), "it left something behind"
+    assert not list(native.cache_folder().iterdir()), "it left something behind"
 
 
 @pytest.mark.parametrize("text", [FAILING, GARBLING, "exit 1"], ids=["fails", "writes garbage", "is no compiler"])
@@ -487,12 +497,12 @@ def test_after_a_compiler_that_does_not_work_the_next_one_is_taken(small_library
 
 def test_the_key_of_the_cache_has_all_that_the_library_depends_on(monkeypatch):
     compiler, code = next(native.compilers()), cpu.code("tables", "double")
-    keys = [native._key(compiler, code), native._key(compiler, cpu.code("other tables", "double"))]
-    keys += [native._key(compiler, cpu.code("tables", "float")), native._key(compiler._replace(version="2"), code)]
+    keys = [native.key_of(compiler, code), native.key_of(compiler, cpu.code("other tables", "double"))]
+    keys += [native.key_of(compiler, cpu.code("tables", "float")), native.key_of(compiler._replace(version="2"), code)]
     monkeypatch.setattr(native, "cpu_flags", lambda: "of another CPU")
-    keys.append(native._key(compiler, code))
-    monkeypatch.setattr(jax.lib, "__version__", "0.0.1")
-    keys.append(native._key(compiler, code))
+    keys.append(native.key_of(compiler, code))
+    monkeypatch.setattr(native, "installed_version", lambda name: "0.0.1")
+    keys.append(native.key_of(compiler, code))
     assert len(set(keys)) == len(keys)
 
 
@@ -527,16 +537,16 @@ def test_it_compiles_for_aarch64(robot, tmp_path):
         str(cpu.HERE / "lanes.cpp"),
     ]
     out = tmp_path / "step.so"
-    command = [*chosen, *native._FLAGS, "-DREAL=double", '-DMODEL="model.h"', *paths, "-o", str(out)]
+    command = [*chosen, *native.FLAGS, "-DREAL=double", '-DMODEL="model.h"', *paths, "-o", str(out)]
     subprocess.run(command, check=True, env=os.environ | {"ZIG_GLOBAL_CACHE_DIR": str(tmp_path / "zig")})
     machine = int.from_bytes(out.read_bytes()[18:20], "little")
     assert machine == 183  # EM_AARCH64
 
 
 def test_a_damaged_library_is_compiled_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(native, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(native, "cache_folder", lambda: tmp_path)
     made = small_code("<body><joint/><geom size='.2'/></body>")
-    path = tmp_path / f"fused_{native._key(next(native.compilers()), made)}.so"
+    path = tmp_path / f"fused_{native.key_of(next(native.compilers()), made)}.so"
     path.write_bytes(b"half a libr")
     assert native.library(made) == path and path.stat().st_size > 1000
 

@@ -133,9 +133,9 @@ def test_tracebacks_are_printed_for_mistakes_only(capfd):
 def test_ctrl_c_on_the_way_in_is_an_error():
     """A signal that waits when XLA calls strikes at the first bytecode, which is before any `try` of ours."""
     host_call.register(sums)
-    handler, messages = host_call._alive[-1], []
+    handler, messages = host_call.handlers[-1], []
 
-    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(host_call._Error))
+    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(host_call.ErrorArguments))
     def create_error(arguments):
         messages.append(arguments[0].message.decode())
         return 1
@@ -143,7 +143,7 @@ def test_ctrl_c_on_the_way_in_is_an_error():
     def strike(*_):
         raise KeyboardInterrupt
 
-    api = host_call._Api(create_error=ctypes.cast(create_error, ctypes.c_void_p))
+    api = host_call.Api(create_error=ctypes.cast(create_error, ctypes.c_void_p))
     frame = ctypes.pointer(host_call.Frame(api=ctypes.addressof(api)))
     assert handler(frame) is None
     send, before = ctypes.CDLL(None)["raise"], signal.signal(signal.SIGUSR1, strike)
@@ -261,15 +261,15 @@ def test_xla_accepts_the_abi_we_speak():
         line.split()[1:3] for line in include.read_text().splitlines() if "API_M" in line and "#define" in line
     )
     major, minor = (int(defined[f"XLA_FFI_API_{part}"]) for part in ("MAJOR", "MINOR"))
-    assert host_call._ABI[0] == major and host_call._ABI[1] <= minor
-    extension, metadata = host_call._Extension(), host_call._Metadata()
-    extension.type, extension.metadata = host_call._METADATA, ctypes.pointer(metadata)
-    assert host_call._describe(ctypes.addressof(extension))
-    assert (metadata.version.major, metadata.version.minor) == host_call._ABI
+    assert host_call.ABI[0] == major and host_call.ABI[1] <= minor
+    extension, metadata = host_call.Extension(), host_call.Metadata()
+    extension.type, extension.metadata = host_call.METADATA, ctypes.pointer(metadata)
+    assert host_call.describe(ctypes.addressof(extension))
+    assert (metadata.version.major, metadata.version.minor) == host_call.ABI
     extension.type += 1
-    assert not host_call._describe(ctypes.addressof(extension))
+    assert not host_call.describe(ctypes.addressof(extension))
 
 
 def test_structures_are_laid_out_as_in_the_header():
-    sizes = {name: ctypes.sizeof(getattr(host_call, name)) for name in ("_Buffer", "_List", "Frame", "_Version")}
-    assert sizes == {"_Buffer": 48, "_List": 40, "Frame": 128 - 8, "_Version": 24}
+    sizes = {name: ctypes.sizeof(getattr(host_call, name)) for name in ("Buffer", "Buffers", "Frame", "Version")}
+    assert sizes == {"Buffer": 48, "Buffers": 40, "Frame": 128 - 8, "Version": 24}

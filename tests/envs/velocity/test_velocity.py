@@ -20,6 +20,7 @@ from paths import DATA
 NAMES = [f"velocity_{variant}" for variant in VARIANTS]
 PLACES = ("torso_xpos", "com")  # what `restore` takes next to qpos, of the robots that have it
 # engine -> largest error of qpos, qvel, reward, obs; share of rows that may be over
+PLAIN = {"observation": "raw", "physics": "mujoco"}  # an engine that has nothing to compile
 TOLERANCES = {"mujoco": (2e-5, 5e-4, 5e-4, 1e-3, 0.002), "mjx": (5e-5, 5e-3, 1e-3, 2e-3, 0.01)}
 TOLERANCES["fused"] = TOLERANCES["warp"] = TOLERANCES["mujoco"]
 EDGE = 1e-4  # m/s to the threshold, within which float32 may decide either way
@@ -87,7 +88,7 @@ def test_reproduces_the_recorded_steps_on_fused(name):
 
 
 # MJX compiles a robot for up to a minute: the one in a fluid in .ci/run, the others by hand. Contacts on MJX are those
-# of the ant in tests/envs/ant/test_corridor.py.
+# of the hands in tests/envs/hands/test_hand_over.py.
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=pytest.mark.full if x == "velocity_swimmer_2x1" else pytest.mark.slow) for x in NAMES],
@@ -154,8 +155,8 @@ def test_padding_of_unequal_agents_is_ignored():
 
 
 def test_any_partition_drives_the_same_robot():
-    whole = envs.make("velocity_half_cheetah_2x3", partition=((5, 4, 3, 2, 1), (0,)), observation="raw")
-    halves = envs.make("velocity_half_cheetah_2x3", observation="raw")
+    whole = envs.make("velocity_half_cheetah_2x3", partition=((5, 4, 3, 2, 1), (0,)), **PLAIN)
+    halves = envs.make("velocity_half_cheetah_2x3", **PLAIN)
     assert whole.spec.action_mask.tolist() == [[1] * 5, [1, 0, 0, 0, 0]] and whole.spec.obs_dim == 19
     ctrl = np.linspace(-1.2, 1.2, 6, dtype=np.float32)
     state = halves.reset(jax.random.key(0))
@@ -183,7 +184,7 @@ def test_costs_of_speed():
 
 
 def test_falling_as_a_second_cost():
-    env = envs.make("velocity_hopper_3x1", fall_cost=True)
+    env = envs.make("velocity_hopper_3x1", fall_cost=True, physics="mujoco")
     assert env.spec.num_costs == 2 and env.spec.cost_limit == (25.0, 0.1)
     lying = np.array([0, 0.5, 0, 0, 0, 0])
     for qpos, expected in ((env.model.qpos0, 0), (lying, 1)):
@@ -194,7 +195,7 @@ def test_falling_as_a_second_cost():
 
 
 def test_raw_observations_are_the_state_and_who_observes():
-    env = envs.make("velocity_walker2d_2x3", observation="raw")
+    env = envs.make("velocity_walker2d_2x3", **PLAIN)
     state = env.restore(env.model.qpos0, np.full(9, 20.0))
     np.testing.assert_array_equal(state.global_state, [*env.model.qpos0[1:], *[10.0] * 9])  # velocities are clipped
     np.testing.assert_array_equal(state.obs, np.c_[np.tile(state.global_state, (2, 1)), np.eye(2)])
@@ -216,7 +217,7 @@ def test_resets_draw_what_the_tasks_say():
 
 
 def test_a_picture_shows_speed_by_a_bar_and_too_much_of_it_in_red():
-    env = envs.make("velocity_half_cheetah_2x3")
+    env = envs.make("velocity_half_cheetah_2x3", physics="mujoco")
     data, scene = mujoco.MjData(env.model), mujoco.MjvScene(env.model, maxgeom=50)
     data.qpos[0] = 57.3
     mujoco.mj_forward(env.model, data)

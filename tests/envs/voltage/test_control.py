@@ -125,13 +125,13 @@ def test_a_date_without_solution_is_drawn_again(monkeypatch: pytest.MonkeyPatch)
     keys = jax.random.split(jax.random.key(0), 16)
     env = folder_env()
     before = jax.jit(jax.vmap(env.reset))(keys).carry
-    solve = env._solve_first
+    solve = env.solve_first
 
     def of_odd_rows(row: jax.Array, *rest: jax.Array):
         carry = solve(row, *rest)
         return dataclasses.replace(carry, line_loss_mw=jnp.where(row % 2 == 1, carry.line_loss_mw, jnp.nan))
 
-    monkeypatch.setattr(env, "_solve_first", of_odd_rows)
+    monkeypatch.setattr(env, "solve_first", of_odd_rows)
     after = jax.jit(jax.vmap(env.reset))(keys).carry
     odd = np.asarray(before.start_row) % 2 == 1
     assert 0 < odd.sum() < 16 and (after.start_row % 2 == 1).all() and np.isfinite(after.line_loss_mw).all()
@@ -273,7 +273,7 @@ def test_profiles_in_the_package() -> None:
 def test_rows_between_knots_are_on_straight_lines(tmp_path: Path) -> None:
     env = envs.make("voltage_33", noise=False)
     knots = np.concatenate([env.profiles.pv, env.profiles.p_load, env.profiles.q_load], axis=1)
-    rows = jax.jit(jax.vmap(env._data_row))(jnp.array([100, 102, 105]))
+    rows = jax.jit(jax.vmap(env.data_row))(jnp.array([100, 102, 105]))
     np.testing.assert_allclose(rows[0], knots[20], rtol=1e-6)
     np.testing.assert_allclose(rows[1], 0.6 * knots[20] + 0.4 * knots[21], rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(rows[2], knots[21], rtol=1e-6)
