@@ -44,14 +44,13 @@ DEVICE void advance_free_joint(World& w, int q, int d) {
     real s, c;
     sine_cosine(real(0.5) * TIMESTEP * squared * inverse, &s, &c);
     const Vec b = spin * (s * inverse);
-    const real w1 = qw * c - dot(v, b);
-    const Vec v1 = b * qw + v * c + cross(v, b);
-    const real norm = inverse_root(w1 * w1 + dot(v1, v1));
-    qw = w1 * norm;
-    v = v1 * norm;
+    const real turned = qw * c - dot(v, b);
+    v = b * qw + v * c + cross(v, b);
+    qw = turned;
   }
-  w.qpos[q + 3] = qw;
-  put(w.qpos + q + 4, v);
+  const real norm = inverse_root(qw * qw + dot(v, v));
+  w.qpos[q + 3] = qw * norm;
+  put(w.qpos + q + 4, v * norm);
 }
 
 // qpos = start_qpos advanced by a time step of `rate` (mj_integratePos).
