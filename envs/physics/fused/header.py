@@ -26,7 +26,17 @@ def header(tables: Tables) -> str:
             "PointRow",
             "POINTS",
             (
-                (p.body, p.place, p.axis.any() and not p.corner, p.corner, p.centre, p.axis, p.radius, p.height, p.contact)
+                (
+                    p.body,
+                    p.place,
+                    p.axis.any() and not p.corner,
+                    p.corner,
+                    p.centre,
+                    p.axis,
+                    p.radius,
+                    p.height,
+                    p.contact,
+                )
                 for p in t.points
             ),
         ),

@@ -83,8 +83,8 @@ class Contact(NamedTuple):
     Attributes:
       dims: 3, 4 or 6 directions: the normal and both tangents; spin about the normal; rolling about both tangents. The
         pyramid has two edges for each but the normal.
-      friction: [5], mu of the directions after the normal; 0 of a frictionless contact, whose row is four equal edges of
-        a quarter each.
+      friction: [5], mu of the directions after the normal; 0 of a frictionless contact, whose row is four equal edges
+        of a quarter each.
       margin: m, a contact exists up to this distance.
       impedance: see `Impedance`.
       regularisation: R of each edge is this times (1 - imp) / imp.
@@ -118,8 +118,9 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A slide, a hinge or a free joint, in the order of the tree. A base that is a free root has none: its frame is that
-    of everything.
+    """A slide, a hinge or a free joint, in the order of the tree.
+
+    A base that is a free root has none: its frame is that of everything.
 
     A body's frame is its parent's, then for each of its joints: moved to `anchor` (a slide: moved on along `axis`),
     turned about `axis` (a hinge), turned by `rotation`, moved back by `position`. A free joint's frame is its qpos.
@@ -540,7 +541,9 @@ class _Tree:
                 Joint(
                     hinge=hinge,
                     free=free,
-                    shift=bool(not hinge and not free and alone and abs(axis[2]) < 1e-12 and (rotation == np.eye(3)).all()),
+                    shift=bool(
+                        not hinge and not free and alone and abs(axis[2]) < 1e-12 and (rotation == np.eye(3)).all()
+                    ),
                     body=len(self.moving),
                     qpos=int(m.jnt_qposadr[j]),
                     dof=int(m.jnt_dofadr[j]),

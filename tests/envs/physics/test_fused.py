@@ -189,7 +189,8 @@ SMALL = {
             <geom type='box' size='.1 .05 .04'/><site name='s' pos='.1 .05 0' euler='10 20 30'/></body></body>""",
 }
 SERVOS = """<position joint='h' kp='2' kv='.1' forcerange='-1 1'/><velocity joint='i' kv='.3' gear='2'/>
-    <general site='s' gear='1 .5 -.3 .2 .1 .4' biastype='affine' biasprm='.1 0 -.2' ctrlrange='-1 1' forcerange='-.6 .6'/>"""
+    <general site='s' gear='1 .5 -.3 .2 .1 .4' biastype='affine' biasprm='.1 0 -.2' ctrlrange='-1 1'
+      forcerange='-.6 .6'/>"""
 
 
 CONTACTS = dict(zip(list(SMALL)[3:], (2, 2, 1, 1, 2, 2, 2, 1, 12, 5), strict=True))  # of the reference pose

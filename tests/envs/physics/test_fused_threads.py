@@ -12,8 +12,21 @@ from envs.errors import TaskError
 from envs.multi_goal import models as goals
 from envs.physics.fused import nvrtc, threads
 from envs.physics.fused.model import Tables, obstacle, tables
-from stepping import ROBOTS, THIN, Rows, answers, anywhere, by_c, crowded, errors, exact, kinds, model_of
-from stepping import readout_of, states
+from stepping import (
+    ROBOTS,
+    THIN,
+    Rows,
+    answers,
+    anywhere,
+    by_c,
+    crowded,
+    errors,
+    exact,
+    kinds,
+    model_of,
+    readout_of,
+    states,
+)
 from threads_on_cpu import compiled, runner
 
 

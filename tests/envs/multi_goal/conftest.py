@@ -1,0 +1,7 @@
+"""Shared by the tests of MultiGoal."""
+
+from __future__ import annotations
+
+from native import quick_compiler
+
+__all__ = ["quick_compiler"]
