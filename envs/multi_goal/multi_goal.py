@@ -104,8 +104,8 @@ class MultiGoal:
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
         keep running moments).
       vase_slots: vases that a step simulates: those that move and the nearest to a robot. The others stay as they are.
-      physics: `auto`, `mujoco` or `mjx`; see `envs.physics`.
-      threads: of `mujoco`, which the devices of a process share; all usable CPUs if None.
+      physics: `auto`, `fused`, `mujoco` or `mjx`; see `envs.physics`.
+      threads: of `fused` and `mujoco`, which the devices of a process share; all usable CPUs if None.
     """
 
     @typed

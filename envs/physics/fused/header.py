@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .model import FIELDS, Body, Joint, Motor, Pair, Place, Tables
+from .model import FIELDS, Body, Joint, Motor, Pair, Place, Point, Tables
 
 
 def header(tables: Tables) -> str:
@@ -22,24 +22,7 @@ def header(tables: Tables) -> str:
         _table("JointRow", "JOINTS", map(_joint, t.joints)),
         _table("PlaceRow", "PLACES", map(_place, t.places)),
         _table("BoxRow", "BOXES", ((b.body, b.centre, b.axes, b.size) for b in t.boxes)),
-        _table(
-            "PointRow",
-            "POINTS",
-            (
-                (
-                    p.body,
-                    p.place,
-                    p.axis.any() and not p.corner,
-                    p.corner,
-                    p.centre,
-                    p.axis,
-                    p.radius,
-                    p.height,
-                    p.contact,
-                )
-                for p in t.points
-            ),
-        ),
+        _table("PointRow", "POINTS", map(_point, t.points)),
         _table(
             "SegmentRow",
             "SEGMENTS",
@@ -134,6 +117,12 @@ def _joint(joint: Joint) -> tuple[Any, ...]:
     turns = not np.array_equal(joint.rotation, np.eye(3))
     addresses = (kind, joint.body, joint.qpos, joint.dof, turns, joint.position.any())
     return (*addresses, joint.reference, joint.axis, joint.anchor, joint.position, joint.rotation, joint.quat)
+
+
+def _point(point: Point) -> tuple[Any, ...]:
+    capsule = point.axis.any() and not point.corner
+    at = (point.body, point.place, capsule, point.corner, point.centre, point.axis)
+    return (*at, point.radius, point.height, point.contact)
 
 
 def _motor(motor: Motor) -> tuple[Any, ...]:

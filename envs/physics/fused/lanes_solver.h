@@ -88,6 +88,10 @@ FUNCTION void solve_unrolled(Worlds& w) {
 
 FUNCTION int highest(unsigned bits) { return 31 - __builtin_clz(bits); }
 FUNCTION int highest(unsigned long long bits) { return 63 - __builtin_clzll(bits); }
+FUNCTION int highest(unsigned __int128 bits) {
+  const unsigned long long high = bits >> 64, low = bits;
+  return high ? 64 + highest(high) : highest(low);
+}
 
 // The same by bits of the pattern, with the fill-in of contacts between branches. A world without such a contact has
 // zeros there, which change nothing.

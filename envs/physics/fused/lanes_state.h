@@ -41,7 +41,8 @@ struct Frame {
   Vec3 place, axes[DIRECTIONS];
 };
 
-typedef Chosen<(NV > 32), unsigned long long, unsigned>::type Dofs;  // a bit for each
+typedef Chosen<(NV > 64), unsigned __int128, unsigned long long>::type WideDofs;
+typedef Chosen<(NV > 32), WideDofs, unsigned>::type Dofs;  // a bit for each
 
 // A contact that at least one world has.
 struct Slot {

@@ -26,7 +26,7 @@ import numpy as np
 if TYPE_CHECKING:
     from ..contract import Readout
 
-MOST_DOFS = 64
+MOST_DOFS = 128
 MOST_CONTACTS = 64  # of one world at a time, unless it can never have more
 
 _MINVAL = 1e-15  # mjMINVAL

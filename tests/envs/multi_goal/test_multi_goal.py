@@ -391,7 +391,7 @@ def test_ants_end_on_their_backs_and_points_never():
         ("point_1", {"size": 0.4}, "size must be more than 0.4 m"),
         ("point_1", {"hazards": -1}, "hazards must be at least 0, not -1"),
         ("point_1", {"vase_slots": 0}, "vase_slots must be at least 1, not 0"),
-        ("ant_2", {"physics": "fused", "vase_slots": 10}, "it has 88 degrees of freedom, and the step takes 1 to 64"),
+        ("ant_2", {"physics": "fused", "wiring": "own", "num_agents": 8}, "136 degrees of freedom, and the step takes 1"),
     ],
 )
 def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
@@ -403,7 +403,7 @@ def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
 @compiled
 def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_point_2").engine == "fused"
-    assert envs.make("multi_goal_ant_2", vase_slots=10).engine == "mujoco"
+    assert envs.make("multi_goal_ant_2", wiring="own", num_agents=8).engine == "mujoco"
 
 
 def test_a_picture_shows_goals_hazards_lidars_and_who_pays():

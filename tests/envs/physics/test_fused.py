@@ -101,7 +101,7 @@ def test_the_float_build_is_mujocos_within_its_rounding(robot):
     ("robot", "vases"),
     [
         ("point", 2),
-        *(pytest.param("point", count, marks=pytest.mark.full) for count in (0, 1, 4)),
+        *(pytest.param("point", count, marks=pytest.mark.full) for count in (0, 1, 4, 10)),
         *(pytest.param("ant", count, marks=pytest.mark.full) for count in (0, 1, 4)),
     ],
 )
@@ -374,7 +374,7 @@ REFUSED = {
     "gravity compensation": "<body gravcomp='1'><joint/><geom size='.1'/></body>",
     "free joint with a spring": "<body><joint type='free' stiffness='1'/><geom size='.1'/></body>",
     "(plane and cylinder)": FLOOR + "<body pos='0 0 1'><joint/><geom type='cylinder' size='.1 .1'/></body>",
-    "65 degrees of freedom": 13 * "<body><joint/><joint/><joint/><joint/><joint/><geom size='.1' contype='0'/></body>",
+    "130 degrees of freedom": 26 * "<body><joint/><joint/><joint/><joint/><joint/><geom size='.1' contype='0'/></body>",
     "not horizontal": "<geom type='plane' size='1 1 1' euler='9 0 0'/><body><joint/><geom size='.1'/></body>",
     "(ellipsoid and box)": """<geom type='box' size='1 1 1'/>
         <body><joint/><geom type='ellipsoid' size='.1 .2 .3'/></body>""",
@@ -435,7 +435,7 @@ def test_robots_take_fused_and_hands_and_large_crowds_take_mujoco():
     for kind in walls.WALLS:
         assert physics.resolve("auto", walls.model(kind), {"torso": ("xpos", 1)}) == "fused"
     assert physics.resolve("auto", robots.model("hopper")) == "fused"
-    for robot, number, vases, engine in (("point", 8, 4, "fused"), ("ant", 2, 4, "fused"), ("ant", 5, 0, "mujoco")):
+    for robot, number, vases, engine in (("point", 8, 4, "fused"), ("ant", 2, 10, "fused"), ("ant", 8, 4, "mujoco")):
         assert physics.resolve("auto", goals.model(robot, number, vases, 2.0), forward=True) == engine
 
 
