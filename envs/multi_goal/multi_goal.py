@@ -326,6 +326,8 @@ class MultiGoal:
             "headings": jnp.arctan2(bodies.rotation[:, 1, 0], bodies.rotation[:, 0, 0]),
             "paying": jnp.stack(costs),
             "hazard_lidar": self._lidar(bodies, carry.hazards),
+            "goal_lidar": self._lidar_of_own(bodies, carry.goals),
+            "vase_lidar": self._lidar(bodies, self._vases.qpos(carry.physics)[:, :2]),
         }
 
     def _initial_state(self, carry: Carry) -> State:
@@ -370,6 +372,10 @@ class MultiGoal:
         """[N, bins] of points [P, 2], the same for all robots."""
         return jax.vmap(lambda body: lidar(points, body, self._bins, self._range))(bodies)
 
+    def _lidar_of_own(self, bodies: Any, points: jax.Array) -> jax.Array:
+        """[N, bins] of points [N, 2], for each robot its own alone."""
+        return jax.vmap(lambda body, point: lidar(point[None], body, self._bins, self._range))(bodies, points)
+
     def _lidar_of_others(self, bodies: Any, points: jax.Array) -> jax.Array:
         """[N, bins] of points [N, 2], for each robot without its own."""
         agents = range(self.num_agents)
@@ -384,8 +390,7 @@ class MultiGoal:
         qvel, qacc = (x[: self._vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
         parts = [jax.vmap(sense)(robots, qvel, qacc)]
         if self.own:
-            to_goal = jax.vmap(lambda body, goal: lidar(goal[None], body, self._bins, self._range))
-            parts += [to_goal(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
+            parts += [self._lidar_of_own(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
         else:
             parts += [self._lidar(bodies, goal[None]) for goal in carry.goals]
         if self.level:

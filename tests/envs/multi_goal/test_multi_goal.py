@@ -18,7 +18,9 @@ from envs.blocks import slices
 from envs.errors import TaskError
 from envs.multi_goal import LEVELS, VARIANTS, models
 from envs.multi_goal.groups import groups_of, touched_robots, touched_vases
+from envs.multi_goal.models import COLOURS
 from envs.multi_goal.multi_goal import KINDS, VASE_HEIGHT
+from envs.multi_goal.scene import HAZARD_COLOUR
 from envs.multi_goal.sensing import SENSORS
 from envs.physics import PhysicsState, resolve
 from native import compiled
@@ -391,7 +393,11 @@ def test_ants_end_on_their_backs_and_points_never():
         ("point_1", {"size": 0.4}, "size must be more than 0.4 m"),
         ("point_1", {"hazards": -1}, "hazards must be at least 0, not -1"),
         ("point_1", {"vase_slots": 0}, "vase_slots must be at least 1, not 0"),
-        ("ant_2", {"physics": "fused", "wiring": "own", "num_agents": 8}, "136 degrees of freedom, and the step takes 1"),
+        (
+            "ant_2",
+            {"physics": "fused", "wiring": "own", "num_agents": 8},
+            "136 degrees of freedom, and the step takes 1",
+        ),
     ],
 )
 def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
@@ -406,12 +412,16 @@ def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_ant_2", wiring="own", num_agents=8).engine == "mujoco"
 
 
+VIOLET = HAZARD_COLOUR[:3]
+
+
 def test_a_picture_shows_goals_hazards_lidars_and_who_pays():
     env, *_ = made(*POINT_2)
     paying = stepped(made(*POINT_2), hazard=(-1.6, -1.5))
     calm = stepped(made(*POINT_2))
-    counts, marks = [], []
-    for state in (calm, paying):
+    at_goal = stepped(made(*POINT_2), qpos={3: -0.3, 4: 0.7})
+    counts, marks, seen, found = [], [], [], []
+    for state in (calm, paying, at_goal):
         raw = {name: np.asarray(x) for name, x in jax.jit(env.declares.picture.raw)(state).items()}
         data = mujoco.MjData(env.model)
         data.qpos[:] = raw["qpos"]
@@ -423,11 +433,21 @@ def test_a_picture_shows_goals_hazards_lidars_and_who_pays():
         added = scene.geoms[before : scene.ngeom]
         discs = [g for g in added if g.type == mujoco.mjtGeom.mjGEOM_CYLINDER]
         marks.append(len(added) - len(discs))
-        assert marks[-1] == np.count_nonzero(raw["hazard_lidar"])
+        lidars = ("hazard_lidar", "goal_lidar", "vase_lidar")
+        assert marks[-1] == sum(np.count_nonzero(raw[lidar]) for lidar in lidars)
+        hazards = [g for g in added if g.type == mujoco.mjtGeom.mjGEOM_SPHERE and np.allclose(g.rgba[:3], VIOLET)]
+        seen.append(len(hazards))
+        assert seen[-1] == np.count_nonzero(raw["hazard_lidar"])
+        own = [g for g in added if g.type == mujoco.mjtGeom.mjGEOM_SPHERE and np.allclose(g.rgba[:3], COLOURS[1])]
+        for brightest in sorted(own, key=lambda g: g.rgba[3])[-1:]:  # in the goal's direction, within half a bin
+            at, goal = (x[:2] - raw["robots"][1][:2] for x in (brightest.pos, raw["goals"][1]))
+            assert at @ goal / np.linalg.norm(at) / np.linalg.norm(goal) > np.cos(np.pi / 16 + 1e-6)
+        found.append(len(own))
         np.testing.assert_allclose([discs[0].pos[:2], discs[1].pos[:2]], raw["goals"], atol=1e-6)
         counts.append(len(discs))
-    assert counts == [12, 13]  # two goals and ten hazards, and a disc below the robot that pays
-    assert marks[0] == 0 < marks[1]  # all hazards of the first are out of reach
+    assert counts == [12, 13, 12]  # two goals and ten hazards, and a disc below the robot that pays
+    assert seen[0] == 0 < seen[1]  # all hazards of the first are out of reach
+    assert found[0] == 0 < found[2]  # and the goal of the first robot 1
 
 
 @pytest.mark.full
