@@ -323,6 +323,14 @@ def test_ptx_is_compiled_once_and_found_again(tmp_path, monkeypatch):
 
 
 @nvidia
+@pytest.mark.parametrize(("robot", "vases"), [("point", 4), ("ant", 0)])
+def test_ptx_of_boxes_and_several_trees_is_compiled(robot, vases, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    made_of = tables(goals.model(robot, 2, vases, 1.5), goals.SUBSTEPS, {"qacc": ("qacc", slice(None))}, forward=True)
+    assert ".entry fused_step" in nvrtc.step_ptx(threads.source(made_of), "9.0")
+
+
+@nvidia
 def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path, monkeypatch):
     blocked = tmp_path / "file"
     blocked.write_text("")
