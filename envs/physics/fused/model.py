@@ -411,9 +411,9 @@ class Tables:
 
     def reach(self, pair: Pair) -> float:
         """m, between the middles of two, or a segment's and a box: further apart they cannot touch."""
-        kinds = ((self.blocks if pair.blocks else self.segments), (self.blocks if pair.blocks == 2 else self.segments))
-        both = [kind[k] for kind, k in zip(kinds, (pair.first, pair.second), strict=True)]
-        return pair.contact.margin + sum(x.extent for x in (both[1:] if pair.blocks == 1 else both))
+        first = 0.0 if pair.blocks == 1 else (self.blocks if pair.blocks else self.segments)[pair.first].extent
+        second = (self.blocks if pair.blocks == 2 else self.segments)[pair.second].extent
+        return pair.contact.margin + first + second
 
 
 def tables(
