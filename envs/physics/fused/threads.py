@@ -19,6 +19,7 @@ from .model import FIELDS, Contact, Impedance, Tables, dofs_of
 LANES = 32
 MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
 MOST_SEGMENTS, MOST_PAIRS = 512, 4096  # what a multiprocessor's memory has room for in each of its worlds
+MOST_BYTES = 49_152  # of memory that a block's threads share, without asking for more
 
 _LONGEST_TRUNK = 9  # its triangle is in every lane's registers
 _ROUND_COST = 60.0  # of a round of the branches, in a trunk's multiplications
@@ -53,7 +54,38 @@ def obstacle(tables: Tables) -> str | None:
     for what, (size, most) in sizes.items():
         if size > most:
             return f"cannot step this model: it has {size} {what}, and a warp takes {most}"
+    needed = shared_bytes(tables)
+    if needed > MOST_BYTES:
+        return f"cannot step this model: a world of it takes {needed} bytes, and a warp's memory has {MOST_BYTES}"
     return None
+
+
+def shared_bytes(t: Tables) -> int:
+    """Of what the lanes of a world share: `World` in threads_smooth.h, to some 100 bytes."""
+    trunk, more, slots = schedule(t).trunk, t.directions > 3, _slot_count(t)
+    packed = trunk * (trunk + 3) // 2 + 4
+    numbers = max(17 * (len(t.joints) + 1), 7 * t.nv, packed + 2 * t.nv + 4)
+    numbers += t.nv * (_fours(t.nv) + (t.nv + 1 | 1) + 7 + 14) + 2 * t.nq + 9 + 35 * len(t.bodies) + 14 * len(t.boxes)
+    numbers += slots * (_fours((8 if more else 4) * _most_columns(t)) + (24 if more else 12))
+    numbers += 0 if _own_slots(t) else 13 * slots + t.nv
+    numbers += 2 * t.nu + (7 * (len(t.segments) + 1) + len(t.pairs) // 2 if t.pairs else 0)
+    return 4 * numbers
+
+
+def _fours(count: int) -> int:
+    """As in threads_smooth.h."""
+    fours = -(-count // 4)
+    return 4 * (fours if fours % 2 else fours + 1)
+
+
+def _most_columns(t: Tables) -> int:
+    """Of a contact's Jacobian."""
+    return max([len(t.bodies[p.body].chain) for p in t.points] + [len(p.dofs) for p in t.pairs], default=1)
+
+
+def _slot_count(t: Tables) -> int:
+    """Contacts of a world at a time."""
+    return max(1, len(t.points) if _own_slots(t) else min(MOST_SLOTS, t.most_contacts))
 
 
 def schedule(tables: Tables) -> Schedule:
@@ -191,8 +223,6 @@ def _number(value: float) -> str:
 
 
 def _sizes(out: _Writer, t: Tables) -> None:
-    own = _own_slots(t)
-    columns = [len(t.bodies[p.body].chain) for p in t.points] + [len(p.dofs) for p in t.pairs]
     out.define(
         NQ=t.nq,
         NV=t.nv,
@@ -211,9 +241,9 @@ def _sizes(out: _Writer, t: Tables) -> None:
         BLOCKS_IN_PAIRS=len(t.blocks),
         DIRECTIONS=t.directions,
         SEGMENTS=len(t.segments),
-        OWN_SLOTS=own,
-        SLOTS=max(1, len(t.points) if own else min(MOST_SLOTS, t.most_contacts)),
-        COLUMNS=max(columns, default=1),
+        OWN_SLOTS=_own_slots(t),
+        SLOTS=_slot_count(t),
+        COLUMNS=_most_columns(t),
         LIMITS=len(t.limits),
         FLUID=bool(t.boxes),
         BOXES=len(t.boxes),

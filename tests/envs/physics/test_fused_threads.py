@@ -27,7 +27,7 @@ from stepping import (
     readout_of,
     states,
 )
-from threads_on_cpu import compiled, runner
+from threads_on_cpu import compiled, runner, world_bytes
 
 
 @functools.cache
@@ -293,6 +293,23 @@ def test_more_bodies_than_lanes_are_refused():
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     reason = threads.obstacle(tables(model, 1, {}))
     assert reason is not None and "33 moving bodies" in reason and "32" in reason
+
+
+@compiled
+@pytest.mark.parametrize("robot", ["walls", *(pytest.param(x, marks=pytest.mark.full) for x in ROBOTS)])
+def test_the_bytes_of_a_world_are_as_counted(robot):
+    counted, right = threads.shared_bytes(made(robot)[1]), world_bytes(made(robot)[1])
+    assert right <= counted < 1.05 * right
+
+
+def test_more_bytes_than_a_block_has_are_refused():
+    joints = "<joint axis='0 1 0'/><joint axis='1 0 0'/>"
+    link = "<body pos='0 0 .2'>" + joints + "<geom type='capsule' size='.05 .1' condim='6'{}/>{}</body>"
+    chains = ""
+    for kind in (" contype='1' conaffinity='2'", " contype='2' conaffinity='1'"):
+        chains += functools.reduce(lambda inner, _, kind=kind: link.format(kind, inner), range(8), "")
+    made_of = tables(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{chains}</worldbody></mujoco>"), 1, {})
+    assert made_of.nv == 32 and "bytes, and a warp's memory has 49152" in str(threads.obstacle(made_of))
 
 
 def test_more_pairs_than_a_world_lists_are_refused():
