@@ -114,7 +114,7 @@ def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
         "motors": ("qfrc_actuator", slice(None)),
     }
     theirs = by_c(model, rows, 0, readout, forward=True)
-    assert (np.abs(theirs["forces"]).max((1, 2)) > 0).mean() > 0.5
+    assert (np.abs(theirs["forces"]).max((1, 2)) > 0).mean() > 0.3
     theirs |= {"warmstart": rows[:, -model.nv - model.nu : len(rows[0]) - model.nu]}
     check(by_fused(model, rows, 0, readout, forward=True), theirs, 1e-8, 0.02)
     ours = by_fused(model, rows, goals.SUBSTEPS, readout, forward=True)
