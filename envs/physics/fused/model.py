@@ -533,6 +533,8 @@ class _Tree:
         m = self._m
         for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]):
             hinge, free = bool(m.jnt_type[j] == _HINGE), bool(m.jnt_type[j] == _FREE)
+            if free:  # its qpos is all that counts
+                position, rotation, quat = np.zeros(3), np.eye(3), np.array([1.0, 0, 0, 0])
             at = np.array(m.jnt_pos[j]) if hinge else np.zeros(3)
             axis = rotation @ m.jnt_axis[j]
             # Only the first bodies' first slides shift all that has mass; a static geom to touch would stay behind.

@@ -256,7 +256,8 @@ def test_boxes_touch_boxes_as_in_c(size):
 def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
     """Two robots among vases: several trees, boxes, all six directions of contacts, and a forward pass at the end."""
     model, rows = exact(goals.model(robot, 2, vases, 1.5)), crowded(robot, vases, 90)
-    readout = {"qacc": ("qacc", slice(None)), "forces": ("cfrc_ext", slice(1, None))}
+    readout = {field: (field, slice(1, None)) for field in ("cfrc_ext", "xpos", "xquat", "cvel", "cinert")}
+    readout["qacc"] = ("qacc", slice(None))
     made_of = tables(model, goals.SUBSTEPS, readout, forward=True)
     assert threads.obstacle(made_of) is None
     right = flat(made_of, by_c(model, rows, goals.SUBSTEPS, readout, forward=True))
