@@ -135,7 +135,8 @@ def crowded(robot: str, vases: int, count: int) -> np.ndarray:
         turn, apart = rng.uniform(-np.pi, np.pi), rng.uniform(0.08, 0.16)
         for k in range(2 + vases):
             start = kind.nq * min(k, 2) + 7 * max(k - 2, 0)
-            angle, reach = turn + k * (np.pi if k < 2 else 1.5), apart if k < 2 else rng.uniform(0.25, 0.4) + 0.25 * ((k - 2) // 4)
+            angle = turn + k * (np.pi if k < 2 else 1.5)
+            reach = apart if k < 2 else rng.uniform(0.25, 0.4) + 0.25 * ((k - 2) // 4)
             data.qpos[start : start + 2] = reach * np.cos(angle), reach * np.sin(angle)
             heading = rng.uniform(-np.pi, np.pi)
             if robot == "point" and k < 2:
