@@ -238,7 +238,6 @@ def _sizes(out: _Writer, t: Tables) -> None:
         PAIRS=len(t.pairs),
         BLOCK_PAIRS=sum(p.blocks == 1 for p in t.pairs),
         BOX_PAIRS=sum(p.blocks == 2 for p in t.pairs),
-        BLOCKS_IN_PAIRS=len(t.blocks),
         DIRECTIONS=t.directions,
         SEGMENTS=len(t.segments),
         OWN_SLOTS=_own_slots(t),
