@@ -178,7 +178,7 @@ def advice(model: mujoco.MjModel) -> str | None:
     """What would make a model's steps faster on this machine, as a sentence; None if nothing is known."""
     if obstacle("mujoco") or obstacle("fused") is None or _refused(model, None):
         return None
-    return f"physics engine 'fused' steps this model more than ten times as fast, but it {obstacle('fused')}"
+    return f"physics engine 'fused' steps this model several times as fast, but it {obstacle('fused')}"
 
 
 def usable_cpus() -> int:
