@@ -221,7 +221,15 @@ BENCHES = {
     ),
     "multi_goal": Bench(
         "MultiGoal tasks: control steps/s of the environment alone next to plain loops with the forward pass",
-        tuple(case for task in GOALS for case in (_plain(task), *_alone(task, (64, 256), physics="mujoco"))),
+        tuple(
+            case
+            for task in GOALS
+            for case in (
+                _plain(task),
+                *_alone(task, (64, 256), physics="fused"),
+                *_alone(task, (64, 256), physics="mujoco"),
+            )
+        ),
         (_plain("multi_goal_point_1"), *_alone("multi_goal_point_1", (64,), physics="mujoco")),
     ),
     "methods": Bench(

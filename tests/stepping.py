@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from envs.ant import corridor, walls
+from envs.multi_goal import models as goals
 from envs.physics.fused import model as tables_of
 from envs.velocity import robots
 
@@ -41,8 +42,11 @@ def readout_of(model: mujoco.MjModel) -> dict:
     return some | {"subtree_com": ("subtree_com", 1)}
 
 
-def by_c(model: mujoco.MjModel, rows: np.ndarray, substeps: int, readout: dict) -> Rows:
-    """What MuJoCo makes of rows [n, qpos qvel warm start ctrl]. No substeps: `warmstart` is the rows' own qacc."""
+def by_c(model: mujoco.MjModel, rows: np.ndarray, substeps: int, readout: dict, forward: bool = False) -> Rows:
+    """What MuJoCo makes of rows [n, qpos qvel warm start ctrl].
+
+    No substeps: `warmstart` is the rows' own qacc. `forward`: readouts are of a forward pass after the substeps.
+    """
     data, found = mujoco.MjData(model), []
     ends = np.cumsum([model.nq, model.nv, model.nv])
     for row in rows:
@@ -51,6 +55,8 @@ def by_c(model: mujoco.MjModel, rows: np.ndarray, substeps: int, readout: dict) 
         if substeps:
             mujoco.mj_step(model, data, substeps)
         else:
+            mujoco.mj_forward(model, data)
+        if forward:
             mujoco.mj_forward(model, data)
         mujoco.mj_rnePostConstraint(model, data)
         warm = data.qacc_warmstart if substeps else data.qacc
@@ -118,6 +124,34 @@ def anywhere(model: mujoco.MjModel, count: int, low: float, high: float) -> np.n
     if model.nu:
         rows[:, -model.nu :] = rng.uniform(-1.2, 1.2, (count, model.nu))
     return rows
+
+
+def crowded(robot: str, vases: int, count: int) -> np.ndarray:
+    """MultiGoal's two robots and vases so close that they touch, along rollouts with random controls."""
+    model, kind = exact(goals.model(robot, 2, vases, 1.5)), goals.ROBOTS[robot]
+    rng, data, rows = np.random.default_rng(5), mujoco.MjData(model), []
+    while len(rows) < count:
+        mujoco.mj_resetData(model, data)
+        turn, apart = rng.uniform(-np.pi, np.pi), rng.uniform(0.08, 0.16)
+        for k in range(2 + vases):
+            start = kind.nq * min(k, 2) + 7 * max(k - 2, 0)
+            angle = turn + k * (np.pi if k < 2 else 1.5)
+            reach = apart if k < 2 else rng.uniform(0.25, 0.4) + 0.25 * ((k - 2) // 4)
+            data.qpos[start : start + 2] = reach * np.cos(angle), reach * np.sin(angle)
+            heading = rng.uniform(-np.pi, np.pi)
+            if robot == "point" and k < 2:
+                data.qpos[start + 2] = heading
+                continue
+            data.qpos[start + 2] = 0.1 - 4e-5 if k >= 2 else rng.uniform(0.1, 0.2)
+            data.qpos[start + 3 : start + 7] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+            if k < 2:
+                data.qpos[start + 7 : start + 15] = rng.uniform(-1.5, 1.5, 8)
+        data.qvel[: 2 * kind.nv] = 0.3 * rng.normal(size=2 * kind.nv)
+        for _ in range(3):
+            data.ctrl[:] = rng.uniform(-1, 1, model.nu)
+            rows.append(np.concatenate([data.qpos, data.qvel, data.qacc_warmstart, data.ctrl]))
+            mujoco.mj_step(model, data, goals.SUBSTEPS)
+    return np.array(rows[:count])
 
 
 def at_walls(model: mujoco.MjModel, count: int) -> np.ndarray:

@@ -20,6 +20,7 @@ import scipy.stats
 import envs
 from envs import physics
 from envs.ant import corridor, walls
+from envs.multi_goal import models as goals
 from envs.physics import warp_engine
 from envs.physics.fused import gpu, threads
 from envs.physics.fused.model import tables
@@ -29,6 +30,7 @@ from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import play
 from pmt_jax.training.run_folder import MATMUL_PRECISION
+from stepping import crowded
 from threads_on_cpu import compiled, runner
 
 pytestmark = pytest.mark.gpu
@@ -254,6 +256,21 @@ def test_fused_on_a_gpu_is_the_same_source_on_a_cpu(name):
             error = (np.abs(np.asarray(found[field], np.float64) - right[field]) / scale).max(axis=1)
             print(f"{name} {dtype.__name__} {field}: median {np.median(error):.2g}, largest {error.max():.2g}")
             assert np.quantile(error, 0.95) < most
+
+
+@compiled
+@pytest.mark.parametrize(("name", "vases"), [("point", 2), ("point", 4), ("ant", 0)])
+def test_robots_among_vases_on_a_gpu_are_the_same_source_on_a_cpu(name, vases):
+    model, rows = goals.model(name, 2, vases, 1.5), crowded(name, vases, 200).astype(np.float32)
+    made_of = tables(model, goals.SUBSTEPS, {"qacc": ("qacc", slice(None))}, forward=True)
+    states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
+    qpos, qvel, _, overflow, _ = jax.jit(gpu.make_step(made_of))(*map(jnp.asarray, states))
+    right = runner(made_of, np.float32)(*states)
+    assert not np.asarray(overflow).any()
+    for found, expected, most in ((qpos, right["qpos"], 2e-5), (qvel, right["qvel"], 5e-3)):
+        error = np.abs(np.asarray(found) - expected).max(axis=1)
+        print(f"{name}, {vases} vases: median {np.median(error):.2g}, largest {error.max():.2g}")
+        assert np.quantile(error, 0.9) < most
 
 
 @every_robot

@@ -9,8 +9,8 @@ static void load(const real* qpos, const real* qvel, const real* warmstart, cons
   for (int i = 0; i < NV; ++i) {
     w.qvel[i] = qvel[i];
     w.qacc[i] = warmstart[i];
-    w.actuator[i] = motor_force(ctrl, i);
   }
+  load_controls(w, ctrl);
 }
 
 static Outputs outputs(real* readings) {

@@ -48,6 +48,11 @@ def runner(tables: Tables, dtype: type[np.floating]) -> Callable[..., Rows]:
     return run
 
 
+def world_bytes(tables: Tables) -> int:
+    """Of what the lanes of a world share on a GPU."""
+    return _built(threads.source(tables), "float32").world_bytes()
+
+
 @functools.cache
 def _built(source: str, dtype: str) -> ctypes.CDLL:
     """The library, kept for all processes of the tests and the next time, under a hash of all that it is made of."""

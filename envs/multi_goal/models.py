@@ -15,6 +15,7 @@ VASE = 0.1  # m, half the side of a vase
 VASE_MASS = 8e-6  # kg
 _FLOOR, _VASE, _ROBOT = 1, 2, 4  # bits of contype and conaffinity; robot i's is _ROBOT << i
 
+VASE_COLOUR = (0.2, 0.75, 0.8)
 COLOURS = ((0.86, 0.16, 0.12), (0.13, 0.36, 0.85), (0.95, 0.6, 0.1), (0.5, 0.2, 0.7))  # of robots and their goals
 COLOURS += ((0.1, 0.6, 0.6), (0.9, 0.4, 0.7), (0.45, 0.3, 0.15), (0.2, 0.2, 0.25))
 
@@ -105,5 +106,5 @@ def _add_vase(arena: mujoco.MjSpec, number: int) -> None:
         condim=6,
         contype=_VASE,
         conaffinity=_FLOOR | _VASE,
-        rgba=[0.2, 0.75, 0.8, 1.0],
+        rgba=[*VASE_COLOUR, 1.0],
     )

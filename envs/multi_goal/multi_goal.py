@@ -104,8 +104,8 @@ class MultiGoal:
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
         keep running moments).
       vase_slots: vases that a step simulates: those that move and the nearest to a robot. The others stay as they are.
-      physics: `auto`, `mujoco` or `mjx`; see `envs.physics`.
-      threads: of `mujoco`, which the devices of a process share; all usable CPUs if None.
+      physics: `auto`, `fused`, `mujoco` or `mjx`; see `envs.physics`.
+      threads: of `fused` and `mujoco`, which the devices of a process share; all usable CPUs if None.
     """
 
     @typed
@@ -326,6 +326,8 @@ class MultiGoal:
             "headings": jnp.arctan2(bodies.rotation[:, 1, 0], bodies.rotation[:, 0, 0]),
             "paying": jnp.stack(costs),
             "hazard_lidar": self._lidar(bodies, carry.hazards),
+            "goal_lidar": self._lidar_of_own(bodies, carry.goals),
+            "vase_lidar": self._lidar(bodies, self.vases.qpos(carry.physics)[:, :2]),
         }
 
     def _initial_state(self, carry: Carry) -> State:
@@ -370,6 +372,10 @@ class MultiGoal:
         """[N, bins] of points [P, 2], the same for all robots."""
         return jax.vmap(lambda body: lidar(points, body, self._bins, self._range))(bodies)
 
+    def _lidar_of_own(self, bodies: Any, points: jax.Array) -> jax.Array:
+        """[N, bins] of points [N, 2], for each robot its own alone."""
+        return jax.vmap(lambda body, point: lidar(point[None], body, self._bins, self._range))(bodies, points)
+
     def _lidar_of_others(self, bodies: Any, points: jax.Array) -> jax.Array:
         """[N, bins] of points [N, 2], for each robot without its own."""
         agents = range(self.num_agents)
@@ -384,8 +390,7 @@ class MultiGoal:
         qvel, qacc = (x[: self.vases.nv].reshape(agents, -1) for x in (carry.physics.qvel, qacc))
         parts = [jax.vmap(sense)(robots, qvel, qacc)]
         if self.own:
-            to_goal = jax.vmap(lambda body, goal: lidar(goal[None], body, self._bins, self._range))
-            parts += [to_goal(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
+            parts += [self._lidar_of_own(bodies, carry.goals), self._lidar_of_others(bodies, carry.goals)]
         else:
             parts += [self._lidar(bodies, goal[None]) for goal in carry.goals]
         if self.level:

@@ -96,7 +96,7 @@ def make_engine(
         from .fused_engine import FusedEngine
 
         try:
-            return FusedEngine(model, substeps, readout, threads, contacts)
+            return FusedEngine(model, substeps, readout, threads, contacts, forward)
         except NoLibrary as error:
             if physics != "auto":
                 raise TaskError(f"physics 'fused' {error}") from error

@@ -123,8 +123,8 @@ def obstacle(
 ) -> str | None:
     """Why an engine cannot run here, as the rest of a sentence that begins with its name; None if it can.
 
-    `fused` depends on the model, its readouts and the forward pass, `warp` on the forward pass. Without a model, the
-    answer is about the machine alone.
+    `fused` depends on the model and its readouts, `warp` on the forward pass. Without a model, the answer is about the
+    machine alone.
     """
     device = jax.devices()[0]
     if physics == "fused":
@@ -148,8 +148,6 @@ def _fused_obstacle(
     if not on_cpu and not _is_nvidia(device):
         return f"runs on CPUs and NVIDIA GPUs; found {device.device_kind} (take 'mjx')"
     reason = None if model is None else _refused(model, readout, on_cpu)
-    if forward and not reason:
-        reason = "cannot step this model: its step has no forward pass after the substeps"
     if reason:
         return f"{reason} (take '{'mujoco' if on_cpu else 'mjx' if forward else 'warp'}')"
     if on_cpu:
@@ -180,7 +178,7 @@ def advice(model: mujoco.MjModel) -> str | None:
     """What would make a model's steps faster on this machine, as a sentence; None if nothing is known."""
     if obstacle("mujoco") or obstacle("fused") is None or _refused(model, None):
         return None
-    return f"physics engine 'fused' steps this model more than ten times as fast, but it {obstacle('fused')}"
+    return f"physics engine 'fused' steps this model several times as fast, but it {obstacle('fused')}"
 
 
 def usable_cpus() -> int:

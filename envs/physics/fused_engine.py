@@ -43,9 +43,10 @@ class FusedEngine(Remade):
         readout: Readout,
         threads: int | None = None,
         contacts: int | None = None,
+        forward: bool = False,
     ):
         threads = usable_cpus() if threads is None else int(at_least("threads", threads, 1))
-        self._model, self._tables = model, tables(model, substeps, readout, contacts)
+        self._model, self._tables = model, tables(model, substeps, readout, contacts, forward)
         self._on_gpu = gpu.make_step(self._tables) if jax.default_backend() == "gpu" else None
         if self._on_gpu is None:
             # A process's devices step at the same time and share the threads.

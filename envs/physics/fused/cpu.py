@@ -16,7 +16,7 @@ Step = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], list[jax.Array]]
 
 HERE = pathlib.Path(__file__).parent
 _SOURCES = ("lanes.cpp", *sorted(path.name for path in HERE.glob("lanes*.h")))
-_SOURCES += ("algebra.h", "boxes.h", "formulae.h", "rows.h", "vector.h")
+_SOURCES += ("algebra.h", "box_pair.h", "boxes.h", "formulae.h", "rows.h", "vector.h")
 
 
 def make_step(tables: Tables, threads: int, real: str = "double") -> Step:
@@ -33,11 +33,12 @@ def make_step(tables: Tables, threads: int, real: str = "double") -> Step:
     """
     (target,) = native.targets(code(header(tables), real))
     widths = (tables.nq, tables.nv, tables.nv, tables.width, 1)
+    numbers = {"substeps": np.int64(tables.substeps), "threads": np.int64(threads)}
 
     def step(*operands: jax.Array) -> list[jax.Array]:
         shape, dtype = operands[0].shape[:-1], operands[0].dtype
         results = [jax.ShapeDtypeStruct((*shape, width), dtype) for width in widths]
-        return list(jax.ffi.ffi_call(target, results)(*operands, threads=np.int64(threads)))
+        return list(jax.ffi.ffi_call(target, results)(*operands, **numbers))
 
     return step
 

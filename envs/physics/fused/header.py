@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .model import FIELDS, Body, Joint, Pair, Place, Tables
+from .model import FIELDS, Body, Joint, Motor, Pair, Place, Point, Tables
 
 
 def header(tables: Tables) -> str:
@@ -22,11 +22,7 @@ def header(tables: Tables) -> str:
         _table("JointRow", "JOINTS", map(_joint, t.joints)),
         _table("PlaceRow", "PLACES", map(_place, t.places)),
         _table("BoxRow", "BOXES", ((b.body, b.centre, b.axes, b.size) for b in t.boxes)),
-        _table(
-            "PointRow",
-            "POINTS",
-            ((p.body, p.place, p.axis.any(), p.centre, p.axis, p.radius, p.height, p.contact) for p in t.points),
-        ),
+        _table("PointRow", "POINTS", map(_point, t.points)),
         _table(
             "SegmentRow",
             "SEGMENTS",
@@ -35,7 +31,7 @@ def header(tables: Tables) -> str:
         _table("BlockRow", "BLOCKS", (_block(t, k) for k in range(len(t.blocks)))),
         _table("PairRow", "PAIRS", (_pair(t, pair) for pair in t.pairs)),
         _table("LimitRow", "LIMITS", t.limits),
-        _table("MotorRow", "MOTORS", t.motors),
+        _table("MotorRow", "MOTORS", map(_motor, t.motors)),
         _table("ReadingRow", "READINGS", _readings(t)),
         _ragged("int", "CHAINS", chains, columns),
         _ragged("int", "ANCESTORS", t.ancestors, max(1, *map(len, t.ancestors))),
@@ -61,17 +57,20 @@ def _sizes(t: Tables) -> list[str]:
         "NSEGMENTS": len(t.segments),
         "NBLOCKS": len(t.blocks),
         "NPAIRS": len(t.pairs),
-        "NBLOCK_PAIRS": sum(pair.with_block for pair in t.pairs),
+        "NBLOCK_PAIRS": sum(pair.blocks == 1 for pair in t.pairs),
+        "NBOX_PAIRS": sum(pair.blocks == 2 for pair in t.pairs),
         "ROOTED": t.rooted,
         "NLIMITS": len(t.limits),
         "NREADINGS": sum(len(reading.rows) for reading in t.readings.values()),
         "WIDTH": t.width,
-        "SUBSTEPS": t.substeps,
+        "FORWARD": t.forward,
         "RUNGE_KUTTA": t.rk4,
         "HAS_FREE": t.has_free,
         "DAMPED": (t.damping != 0).any(),
         "SPRINGS": (t.stiffness != 0).any(),
         "SHIFTS": any(joint.shift for joint in t.joints),
+        "SERVOS": not all(motor.plain for motor in t.motors),
+        "DIRECTIONS": t.directions,
         "FILLS": t.fills,
         "MOST_CONTACTS": t.most_contacts,
         "ITERATIONS": t.iterations,
@@ -114,10 +113,21 @@ def symmetric(matrix: np.ndarray) -> np.ndarray:
 
 
 def _joint(joint: Joint) -> tuple[Any, ...]:
-    kind = 1 if joint.hinge else 2 if joint.shift else 0
+    kind = 3 if joint.free else 1 if joint.hinge else 2 if joint.shift else 0
     turns = not np.array_equal(joint.rotation, np.eye(3))
     addresses = (kind, joint.body, joint.qpos, joint.dof, turns, joint.position.any())
     return (*addresses, joint.reference, joint.axis, joint.anchor, joint.position, joint.rotation, joint.quat)
+
+
+def _point(point: Point) -> tuple[Any, ...]:
+    capsule = point.axis.any() and not point.corner
+    at = (point.body, point.place, capsule, point.corner, point.centre, point.axis)
+    return (*at, point.radius, point.height, point.contact)
+
+
+def _motor(motor: Motor) -> tuple[Any, ...]:
+    at = (motor.dof, motor.qpos, motor.body, motor.place, motor.push, motor.turn)
+    return (*at, motor.gear, motor.gain, motor.low, motor.high, motor.bias, motor.weakest, motor.strongest)
 
 
 def _place(place: Place) -> tuple[Any, ...]:
@@ -131,9 +141,10 @@ def _pair(t: Tables, pair: Pair) -> tuple[Any, ...]:
 
 def _block(t: Tables, k: int) -> tuple[Any, ...]:
     block = t.blocks[k]
-    own = [c for c, pair in enumerate(t.pairs) if pair.with_block and pair.first == k]
+    own = [c for c, pair in enumerate(t.pairs) if pair.blocks == 1 and pair.first == k]
     reach = block.reach if np.isfinite(block.reach) else 0.0
-    return (block.body, block.place, own[0], own[-1] + 1, block.axes, block.offset, block.size, reach)
+    first, last = (own[0], own[-1] + 1) if own else (0, 0)
+    return (block.body, block.place, first, last, block.axes, block.offset, block.size, reach)
 
 
 def _readings(t: Tables) -> Iterable[tuple[int, int]]:

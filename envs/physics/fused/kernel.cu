@@ -40,8 +40,8 @@ fused_step(const float* __restrict__ qpos, const float* __restrict__ qvel, const
   if (lane < NV) {
     w.qvel[lane] = qvel[lane];
     w.qacc[lane] = warmstart[lane];
-    w.actuator[lane] = motor_force(ctrl, lane);
   }
+  load_controls(w, ctrl);
   MEET();
   bool lost = false;
   control_step(w, out, lost);

@@ -29,8 +29,11 @@ template <class Outside> bool load(Worlds& w, int lane, const Outside* qpos, con
     const MotorRow& motor = MOTORS[k];
     const Real wanted = ctrl[k];
     const Real given = wanted < motor.low ? motor.low : wanted > motor.high ? motor.high : wanted;
-    Num& force = w.motor[motor.dof];
-    set_lane(force, lane, ::lane(force, lane) + motor.gain * given);
+    set_lane(w.drive[k], lane, motor.gain * given);
+    if (!SERVOS) {
+      Num& force = w.motor[motor.dof];
+      set_lane(force, lane, ::lane(force, lane) + motor.gear * motor.gain * given);
+    }
     zero += 0 * wanted;
   }
   set_lane(w.overflow, lane, 0);
@@ -41,12 +44,12 @@ template <class Outside> void store(const Num* from, int lane, int size, Real br
   for (int k = 0; k < size; ++k) to[k] = Outside(::lane(from[k], lane) + broken);
 }
 
-__attribute__((noinline)) void step(Worlds& w) { control_step(w); }
+__attribute__((noinline)) void step(Worlds& w, long substeps) { control_step(w, substeps); }
 
 // -- a batch --
 
 struct Batch {
-  long worlds;
+  long worlds, substeps;
   bool single;
   const void* operands[OPERANDS];
   void* results[RESULTS];
@@ -66,7 +69,7 @@ struct Batch {
       const long r = first + i < worlds ? first + i : first;
       sound[i] = load(w, i, in<Outside>(QPOS, r), in<Outside>(QVEL, r), in<Outside>(WARMSTART, r), in<Outside>(CTRL, r));
     }
-    step(w);
+    step(w, substeps);
     for (int i = 0; i < LANES && first + i < worlds; ++i) {
       const long r = first + i;
       const Real broken = sound[i] ? 0 : NAN;
@@ -92,15 +95,16 @@ void* memory_of(const XLA_FFI_Buffer* buffer, int size, XLA_FFI_DataType dtype, 
 
 }  // namespace
 
-// Operands qpos, qvel, warm start and controls; results: the new ones, readouts and overflow; attribute `threads`.
+// Operands qpos, qvel, warm start and controls; results: the new ones, readouts and overflow; attributes `substeps` and
+// `threads`.
 EXPORTED XLA_FFI_Error* fused_step(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
-  if (frame->args.size != OPERANDS || frame->rets.size != RESULTS || frame->attrs.size != 1 ||
-      frame->attrs.types[0] != XLA_FFI_AttrType_SCALAR) {
+  if (frame->args.size != OPERANDS || frame->rets.size != RESULTS || frame->attrs.size != 2 ||
+      frame->attrs.types[0] != XLA_FFI_AttrType_SCALAR || frame->attrs.types[1] != XLA_FFI_AttrType_SCALAR) {
     return native::failure(frame->api, "fused_step: wrong arguments");
   }
   const XLA_FFI_Buffer* qpos = (const XLA_FFI_Buffer*)frame->args.args[0];
-  Batch batch = {1, qpos->dtype == XLA_FFI_DataType_F32, {}, {}};
+  Batch batch = {1, native::attribute(frame, 0), qpos->dtype == XLA_FFI_DataType_F32, {}, {}};
   for (long d = 0; d + 1 < qpos->rank; ++d) batch.worlds *= qpos->dims[d];
   const XLA_FFI_DataType dtype = batch.single ? XLA_FFI_DataType_F32 : XLA_FFI_DataType_F64;
   bool right = true;
@@ -113,5 +117,5 @@ EXPORTED XLA_FFI_Error* fused_step(XLA_FFI_CallFrame* frame) {
     right &= batch.results[k] || !RESULT_SIZES[k] || !batch.worlds;
   }
   if (!right) return native::failure(frame->api, "fused_step: wrong shapes or types");
-  return native::run(frame, advance, &batch, {(batch.worlds + LANES - 1) / LANES}, native::attribute(frame, 0));
+  return native::run(frame, advance, &batch, {(batch.worlds + LANES - 1) / LANES}, native::attribute(frame, 1));
 }

@@ -11,6 +11,7 @@
 FUNCTION void forward(Worlds& w, bool last) {
   enter_base_frame(w);
   outward(w);
+  if constexpr (SERVOS) drive(w);
   if constexpr (FLUID) push_by_fluid(w);
   inward(w);
   find_constraints(w);
@@ -23,17 +24,20 @@ FUNCTION void forward(Worlds& w, bool last) {
   if (last) read_out(w);
 }
 
+FUNCTION void advance_free_joint(const Num* start, const Num* velocity, Real time, Num* to) {
+  for (int i = 0; i < 3; ++i) to[i] = start[i] + Num(time) * velocity[i];
+  const Quat from = {start[3], start[4], start[5], start[6]};
+  const Quat q = integrated(from, vec(velocity[3], velocity[4], velocity[5]), Num(time));
+  to[3] = q.w, to[4] = q.x, to[5] = q.y, to[6] = q.z;
+}
+
 // qpos = start_qpos moved by `velocity` for `time` (engine_core_util.c, mj_integratePos).
 FUNCTION void advance_qpos(Worlds& w, const Num* velocity, Real time) {
-  if constexpr (HAS_FREE) {
-    for (int i = 0; i < 3; ++i) w.qpos[i] = w.start_qpos[i] + Num(time) * velocity[i];
-    const Quat start = {w.start_qpos[3], w.start_qpos[4], w.start_qpos[5], w.start_qpos[6]};
-    const Quat q = integrated(start, vec(velocity[3], velocity[4], velocity[5]), Num(time));
-    w.qpos[3] = q.w, w.qpos[4] = q.x, w.qpos[5] = q.y, w.qpos[6] = q.z;
-  }
+  if constexpr (HAS_FREE) advance_free_joint(w.start_qpos, velocity, time, w.qpos);
   for (int j = 0; j < NJOINTS; ++j) {
-    const int q = JOINTS[j].qpos;
-    w.qpos[q] = w.start_qpos[q] + Num(time) * velocity[JOINTS[j].dof];
+    const int q = JOINTS[j].qpos, d = JOINTS[j].dof;
+    if (JOINTS[j].kind == FREE) advance_free_joint(w.start_qpos + q, velocity + d, time, w.qpos + q);
+    else w.qpos[q] = w.start_qpos[q] + Num(time) * velocity[d];
   }
 }
 
@@ -82,10 +86,15 @@ FUNCTION void runge_kutta_step(Worlds& w, bool last) {
   for (int i = 0; i < NV; ++i) w.qvel[i] = w.start_qvel[i] + Num(TIMESTEP) * w.mean_acceleration[i];
 }
 
-FUNCTION void control_step(Worlds& w) {
-  for (int substep = 0; substep < SUBSTEPS; ++substep) {
-    const bool last = substep == SUBSTEPS - 1;
+FUNCTION void control_step(Worlds& w, long substeps) {
+  for (long substep = 0; substep < substeps; ++substep) {
+    const bool last = substep == substeps - 1 && !FORWARD;
     if constexpr (RUNGE_KUTTA) runge_kutta_step(w, last);
     else euler_step(w, last);
+  }
+  if constexpr (FORWARD) {
+    for (int i = 0; i < NV; ++i) w.warmstart[i] = w.acceleration[i];
+    forward(w, true);
+    for (int i = 0; i < NV; ++i) w.acceleration[i] = w.warmstart[i];
   }
 }

@@ -1,6 +1,7 @@
 // Contacts and limits: which some world has, their Jacobians, and their residuals at the warm start.
 #pragma once
 #include "lanes_state.h"
+#include "box_pair.h"
 
 // Keeps a world's contacts within its room, and reports where it had too little. Whether any world has the contact.
 FUNCTION bool admit(Worlds& w, Mask& has) {
@@ -20,8 +21,12 @@ FUNCTION Vec3 turned_with_body(const Worlds& w, int b, const Real* axis) {
   return HAS_FREE && b == 0 ? vec(axis) : w.turn[b] * vec(axis);
 }
 
-FUNCTION Frame frame_of(Vec3 place, Vec3 normal, Vec3 tangent, Real friction) {
-  return {place, {normal, tangent * Num(friction), cross(normal, tangent) * Num(friction)}};
+FUNCTION Frame frame_of(Vec3 place, Vec3 normal, Vec3 tangent, const ContactRow& contact) {
+  const Vec3 along[3] = {normal, tangent, cross(normal, tangent)};
+  Frame frame;
+  frame.place = place;
+  for (int x = 0; x < DIRECTIONS; ++x) frame.axes[x] = x ? along[x % 3] * Num(contact.friction[x - 1]) : normal;
+  return frame;
 }
 
 // The weight of an edge and the contact's residuals, J (a + B v) + K imp position (engine_core_constraint.c,
@@ -30,14 +35,14 @@ FUNCTION void finish_slot(Worlds& w, Slot& s, Mask has, Num distance, const Cont
   const ImpedanceRow& row = contact.impedance;
   const Num position = distance - Num(contact.margin);
   const Num imp = impedance(position, Num(row.lowest), Num(row.highest), Num(row.inverse_width));
-  for (int x = 0; x < 3; ++x) s.residual[x] = s.change[x] = Num(0);
+  for (int x = 0; x < DIRECTIONS; ++x) s.residual[x] = s.change[x] = Num(0);
   for (int k = 0; k < s.columns; ++k) {
     const int d = s.dofs[k];
     const Num wanted = w.a[d] + Num(row.damping) * w.velocity[d];
-    for (int x = 0; x < 3; ++x) s.residual[x] += s.jacobian[k][x] * wanted;
+    for (int x = 0; x < DIRECTIONS; ++x) s.residual[x] += s.jacobian[k][x] * wanted;
   }
   s.residual[0] += Num(row.stiffness) * imp * position;
-  s.has = has;
+  s.has = has, s.dims = contact.dims;
   s.weight = select(has, imp * inverse(Num(contact.regularisation) * (Num(1) - imp)), Num(0));
 }
 
@@ -50,6 +55,10 @@ FUNCTION void joint_columns(const Worlds& w, Slot& s, const Frame& frame, int fr
       const Num entry = dot(spin, moments[x]) + dot(move, frame.axes[x]);
       s.jacobian[k][x] = signs ? Num(signs[k]) * entry : entry;
     }
+    for (int x = 3; x < DIRECTIONS; ++x) {
+      const Num entry = dot(spin, frame.axes[x]);
+      s.jacobian[k][x] = signs ? Num(signs[k]) * entry : entry;
+    }
   }
 }
 
@@ -59,9 +68,15 @@ FUNCTION void root_columns(Slot& s, const Frame& frame) {
     s.jacobian[0][x] = axis.x, s.jacobian[1][x] = axis.y, s.jacobian[2][x] = axis.z;
     s.jacobian[3][x] = moment.x, s.jacobian[4][x] = moment.y, s.jacobian[5][x] = moment.z;
   }
+  for (int x = 3; x < DIRECTIONS; ++x) {
+    const Vec3 axis = frame.axes[x];
+    for (int k = 0; k < 3; ++k) s.jacobian[k][x] = Num(0);
+    s.jacobian[3][x] = axis.x, s.jacobian[4][x] = axis.y, s.jacobian[5][x] = axis.z;
+  }
 }
 
 FUNCTION void floor_contacts(Worlds& w) {
+  Num corners = Num(0);  // of the box at hand that touch: four at most do, and none of its upper half
   for (int c = 0; c < NPOINTS; ++c) {
     const PointRow& point = POINTS[c];
     const int b = point.body;
@@ -69,10 +84,16 @@ FUNCTION void floor_contacts(Worlds& w) {
     const Num radius = Num(point.radius);
     const Num distance = dot(up, centre) + w.height - Num(point.height) - radius;
     Mask has = distance <= Num(point.contact.margin);
+    if (point.corner) {
+      if (point.corner == 1) corners = Num(0);
+      if (!any(has)) continue;
+      has &= (dot(up, turned_with_body(w, b, point.axis)) <= Num(0)) & (corners < Num(4));
+      corners += select(has, Num(1), Num(0));
+    }
     if (!admit(w, has)) continue;
     const Vec3 first = point.capsule ? tangent(w.world, up, turned_with_body(w, b, point.axis)) : w.world.y;
     const Vec3 place = centre - up * (radius + Num(Real(.5)) * distance);
-    const Frame frame = frame_of(place, up, first, point.contact.friction);
+    const Frame frame = frame_of(place, up, first, point.contact);
     Slot& s = w.slots[w.slot_count++];
     s.dofs = CHAINS[b], s.columns = NCHAINS[b], s.place1 = 0, s.place2 = point.place;
     if constexpr (HAS_FREE) root_columns(s, frame);
@@ -84,7 +105,7 @@ FUNCTION void floor_contacts(Worlds& w) {
 
 FUNCTION void add_pair(Worlds& w, int c, Mask has, Num distance, Vec3 place, Vec3 normal, int place1, int place2) {
   const PairRow& pair = PAIRS[c];
-  const Frame frame = frame_of(place, normal, tangent(w.world, normal), pair.contact.friction);
+  const Frame frame = frame_of(place, normal, tangent(w.world, normal), pair.contact);
   Slot& slot = w.slots[w.slot_count++];
   slot.dofs = PAIR_DOFS[c], slot.columns = pair.columns, slot.place1 = place1, slot.place2 = place2;
   if (HAS_FREE && pair.rooted) root_columns(slot, frame);
@@ -92,9 +113,10 @@ FUNCTION void add_pair(Worlds& w, int c, Mask has, Num distance, Vec3 place, Vec
   if constexpr (READS_FORCES) slot.frame = frame;
   finish_slot(w, slot, has, distance, pair.contact);
   if constexpr (FILLS) {
-    unsigned all = 0;
-    for (int k = 0; k < pair.columns; ++k) all |= 1u << PAIR_DOFS[c][k];
-    for (int k = 0; k < pair.columns; ++k) w.pattern[PAIR_DOFS[c][k]] |= all & ((1u << PAIR_DOFS[c][k]) - 1);
+    const Dofs one = 1;
+    Dofs all = 0;
+    for (int k = 0; k < pair.columns; ++k) all |= one << PAIR_DOFS[c][k];
+    for (int k = 0; k < pair.columns; ++k) w.pattern[PAIR_DOFS[c][k]] |= all & ((one << PAIR_DOFS[c][k]) - 1);
   }
 }
 
@@ -199,6 +221,72 @@ FUNCTION void block_contacts(Worlds& w) {
   }
 }
 
+FUNCTION Vec3 middle_of(const BlockFrame& in) { return -transposed_times(in.axes, in.shift); }
+
+// The contacts of two boxes in a world whose boxes are near.
+FUNCTION void touch_boxes(int lane, const PairRow& pair, const BlockFrame& first, const BlockFrame& second, Vec3 apart,
+                          Touches& found) {
+  BoxPair boxes;
+  const Vec3 rows1[3] = {first.axes.r0, first.axes.r1, first.axes.r2};
+  const Vec3 rows2[3] = {second.axes.r0, second.axes.r1, second.axes.r2};
+  const Num places[3] = {apart.x, apart.y, apart.z};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) boxes.turn[i][j] = ::lane(dot(rows1[i], rows2[j]), lane);
+    boxes.apart[i] = ::lane(places[i], lane);
+    boxes.size1[i] = BLOCKS[pair.first].size[i], boxes.size2[i] = BLOCKS[pair.second].size[i];
+  }
+  boxes.margin = pair.contact.margin;
+  touch_boxes(boxes, found);
+}
+
+FUNCTION void box_pair(Worlds& w, int c, const BlockFrame& first, const BlockFrame& second, Mask near) {
+  const PairRow& pair = PAIRS[c];
+  const Vec3 apart = first.axes * middle_of(second) + first.shift;
+  const unsigned wanted = signs(near);
+  Touches found[LANES];
+  int most = 0;
+  for (int i = 0; i < LANES; ++i) {
+    found[i].count = 0;
+    if (wanted >> i & 1) touch_boxes(i, pair, first, second, apart, found[i]);
+    most = found[i].count > most ? found[i].count : most;
+  }
+  for (int k = 0; k < most; ++k) {
+    Num place[3], normal[3], distance = Num(0), number = Num(-1);
+    for (int x = 0; x < 3; ++x) place[x] = normal[x] = Num(0);
+    for (int i = 0; i < LANES; ++i) {
+      if (k >= found[i].count) continue;
+      set_lane(distance, i, found[i].distance[k]);
+      set_lane(number, i, Real(k));
+      for (int x = 0; x < 3; ++x) {
+        set_lane(place[x], i, found[i].place[k][x]);
+        set_lane(normal[x], i, found[i].normal[x]);
+      }
+    }
+    Mask has = number >= Num(0);
+    if (!admit(w, has)) continue;
+    const Vec3 inside = vec(place[0], place[1], place[2]) - first.shift;
+    const Vec3 out = transposed_times(first.axes, vec(normal[0], normal[1], normal[2]));
+    const Vec3 at = select(has, transposed_times(first.axes, inside), vec(0, 0, 0));
+    add_pair(w, c, has, select(has, distance, Num(0)), at, select(has, out, w.world.x), BLOCKS[pair.first].place,
+             BLOCKS[pair.second].place);
+  }
+}
+
+FUNCTION void box_contacts(Worlds& w) {
+  BlockFrame frames[at_least_one(NBLOCKS)];
+  Vec3 middles[at_least_one(NBLOCKS)];
+  for (int k = 0; k < NBLOCKS; ++k) {
+    frames[k] = frame_of(w, BLOCKS[k]);
+    middles[k] = middle_of(frames[k]);
+  }
+  for (int c = NPAIRS - NBOX_PAIRS; c < NPAIRS; ++c) {
+    const PairRow& pair = PAIRS[c];
+    const Vec3 apart = middles[pair.first] - middles[pair.second];
+    const Mask near = dot(apart, apart) <= Num(pair.reach * pair.reach * Real(1.0001));
+    if (any(near)) box_pair(w, c, frames[pair.first], frames[pair.second], near);
+  }
+}
+
 FUNCTION void limits(Worlds& w) {
   w.limit_count = 0;
   for (int k = 0; k < NLIMITS; ++k) {
@@ -226,11 +314,12 @@ FUNCTION void find_constraints(Worlds& w) {
   if constexpr (FILLS) {
     for (int i = 0; i < NV; ++i) {
       w.pattern[i] = 0;
-      for (int k = 0; k < NANCESTORS[i]; ++k) w.pattern[i] |= 1u << ANCESTORS[i][k];
+      for (int k = 0; k < NANCESTORS[i]; ++k) w.pattern[i] |= Dofs(1) << ANCESTORS[i][k];
     }
   }
   floor_contacts(w);
   if constexpr (NSEGMENT_PAIRS > 0) pair_contacts(w);
   if constexpr (NBLOCK_PAIRS > 0) block_contacts(w);
+  if constexpr (NBOX_PAIRS > 0) box_contacts(w);
   limits(w);
 }

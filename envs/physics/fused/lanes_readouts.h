@@ -37,6 +37,10 @@ FUNCTION void attitudes(const Worlds& w, Quat* found) {
     for (int j = BODIES[b].first_joint; j < BODIES[b].last_joint; ++j) {
       const JointRow& joint = JOINTS[j];
       const Num angle = w.qpos[joint.qpos] - Num(joint.reference);
+      if (joint.kind == FREE) {
+        const Num* q = w.qpos + joint.qpos + 3;
+        found[b] = {q[0], q[1], q[2], q[3]};
+      }
       if (joint.kind == HINGE) found[b] = found[b] * quat_about(vec(joint.axis), angle);
       if (joint.turns) found[b] = found[b] * quat(joint.quat);
     }
@@ -85,20 +89,27 @@ FUNCTION void contact_forces(const Worlds& w, Num (*on)[6]) {
   for (int c = 0; c < w.slot_count; ++c) {
     const Slot& s = w.slots[c];
     const Num* r = s.residual;
-    const Num edge[4] = {r[0] + r[1], r[0] - r[1], r[0] + r[2], r[0] - r[2]};
-    Num size[4];
-    for (int k = 0; k < 4; ++k) size[k] = select(edge[k] < Num(0), -s.weight * edge[k], Num(0));
+    Num along[DIRECTIONS];
+    for (int k = 0; k < DIRECTIONS; ++k) along[k] = Num(0);
+    for (int k = 1; k <= s.frictions(); ++k) {
+      const Num up = r[0] + r[k], down = r[0] - r[k];
+      const Num first = select(up < Num(0), -s.weight * up, Num(0));
+      const Num second = select(down < Num(0), -s.weight * down, Num(0));
+      along[0] += first + second;
+      along[k] = first - second;
+    }
     const Vec3* axes = s.frame.axes;
-    const Vec3 force = axes[0] * (size[0] + size[1] + size[2] + size[3]) + axes[1] * (size[0] - size[1]) +
-                       axes[2] * (size[2] - size[3]);
+    const Vec3 force = axes[0] * along[0] + axes[1] * along[1] + axes[2] * along[2];
+    Vec3 couple = vec(0, 0, 0);
+    for (int k = 3; k < DIRECTIONS; ++k) couple = couple + axes[k] * along[k];
     for (int side = 0; side < 2; ++side) {
       const int b = side ? s.place2 : s.place1;
       if (!b || !is_moved(PLACES[b])) continue;
       const Vec3 pushed = side ? force : -force;
       const Vec3 arm = s.frame.place - centre_of_tree(w, PLACES[b].root);
-      const Vec3 moment = to_world(w, cross(arm, pushed)), along = to_world(w, pushed);
+      const Vec3 moment = to_world(w, cross(arm, pushed) + (side ? couple : -couple)), pull = to_world(w, pushed);
       on[b][0] += moment.x, on[b][1] += moment.y, on[b][2] += moment.z;
-      on[b][3] += along.x, on[b][4] += along.y, on[b][5] += along.z;
+      on[b][3] += pull.x, on[b][4] += pull.y, on[b][5] += pull.z;
     }
   }
 }
@@ -128,6 +139,7 @@ FUNCTION void read_out(Worlds& w) {
       case CFRC_EXT:
         for (int x = 0; x < 6; ++x) *out++ = forces[row][x];
         break;
+      case QACC: *out++ = w.acceleration[row]; break;
       default: *out++ = w.motor[row];
     }
   }

@@ -37,7 +37,29 @@ FUNCTION void carry(Motion& m, Vec3 offset) {
   m.place = m.place + offset;
 }
 
+// A free joint: its place and attitude are its own, and it has no parent but the world.
+FUNCTION void pass_free_joint(Worlds& w, Motion& m, const JointRow& joint) {
+  const Num* qpos = w.qpos + joint.qpos;
+  const Num* velocity = w.velocity + joint.dof;
+  m.turn = rotation(normalised(Quat{qpos[3], qpos[4], qpos[5], qpos[6]}));
+  m.place = vec(qpos[0], qpos[1], qpos[2]);
+  m.spin = m.turn * vec(velocity[3], velocity[4], velocity[5]);
+  const Vec3 columns[3] = {vec(m.turn.r0.x, m.turn.r1.x, m.turn.r2.x), vec(m.turn.r0.y, m.turn.r1.y, m.turn.r2.y),
+                           vec(m.turn.r0.z, m.turn.r1.z, m.turn.r2.z)};
+  const Vec3 along[3] = {w.world.x, w.world.y, w.world.up};
+  for (int k = 0; k < 3; ++k) {
+    w.axis_spin[joint.dof + k] = vec(0, 0, 0);
+    w.axis_move[joint.dof + k] = along[k];
+    w.axis_spin[joint.dof + 3 + k] = columns[k];
+    w.axis_move[joint.dof + 3 + k] = cross(m.place, columns[k]);
+  }
+  if constexpr (FLUID || reads(CVEL)) {
+    for (int k = 0; k < 6; ++k) m.drift = m.drift + w.axis_move[joint.dof + k] * velocity[k];
+  }
+}
+
 FUNCTION void pass_joint(Worlds& w, Motion& m, const JointRow& joint) {
+  if (joint.kind == FREE) return pass_free_joint(w, m, joint);
   const Vec3 local = vec(joint.axis), axis = m.turn * local;
   const Num position = w.qpos[joint.qpos] - Num(joint.reference), velocity = w.velocity[joint.dof];
   Vec3 anchor = vec(joint.anchor);
@@ -102,6 +124,33 @@ FUNCTION void push_by_fluid(Worlds& w) {
   }
 }
 
+// What a unit of a motor's force at a site does along a degree of freedom.
+FUNCTION Num site_share(const Worlds& w, const MotorRow& motor, int d) {
+  const Mat3& turn = w.turn[motor.body];
+  const Vec3 push = turn * vec(motor.push), arm = w.place[motor.body] + turn * vec(motor.place);
+  return dot(w.axis_spin[d], cross(arm, push) + turn * vec(motor.turn)) + dot(w.axis_move[d], push);
+}
+
+// The forces of motors, which depend on places and speeds (engine_forward.c, mj_fwdActuation).
+FUNCTION void drive(Worlds& w) {
+  for (int i = 0; i < NV; ++i) w.motor[i] = Num(0);
+  for (int k = 0; k < NU; ++k) {
+    const MotorRow& motor = MOTORS[k];
+    const bool at_site = motor.dof < 0;
+    const int* dofs = at_site ? CHAINS[motor.body] : &motor.dof;
+    const int count = at_site ? NCHAINS[motor.body] : 1;
+    Num share[MOST_COLUMNS], speed = Num(0);
+    for (int c = 0; c < count; ++c) {
+      share[c] = at_site ? site_share(w, motor, dofs[c]) : Num(motor.gear);
+      speed += share[c] * w.velocity[dofs[c]];
+    }
+    const Num length = at_site ? Num(0) : Num(motor.gear) * w.qpos[motor.qpos];
+    Num force = w.drive[k] + Num(motor.bias[0]) + Num(motor.bias[1]) * length + Num(motor.bias[2]) * speed;
+    force = clip(force, Num(motor.weakest), Num(motor.strongest));
+    for (int c = 0; c < count; ++c) w.motor[dofs[c]] += share[c] * force;
+  }
+}
+
 FUNCTION void root_rows(Worlds& w) {
   const Num zero = Num(0), mass = Num(BODIES[0].subtree_mass);
   const Vec3 h = w.first_moment[0];
@@ -143,7 +192,9 @@ FUNCTION void joint_row(Worlds& w, int b, int d) {
 
 FUNCTION void inward(Worlds& w) {
   for (int b = NBODIES - 1; b > 0; --b) {
-    for (int j = BODIES[b].last_joint - 1; j >= BODIES[b].first_joint; --j) joint_row(w, b, JOINTS[j].dof);
+    for (int j = BODIES[b].last_joint - 1; j >= BODIES[b].first_joint; --j) {
+      for (int k = JOINTS[j].kind == FREE ? 5 : 0; k >= 0; --k) joint_row(w, b, JOINTS[j].dof + k);
+    }
     const int parent = BODIES[b].parent;
     w.first_moment[parent] = w.first_moment[parent] + w.first_moment[b];
     w.inertia[parent] = w.inertia[parent] + w.inertia[b];

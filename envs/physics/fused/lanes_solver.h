@@ -4,6 +4,7 @@
 #include "lanes_state.h"
 
 constexpr Real IMPROVEMENT = SINGLE ? Real(1e-9) : Real(1e-12);  // the least worth a step, scaled as MuJoCo scales it
+constexpr int EDGES = 2 * (DIRECTIONS - 1);                      // the most of a contact
 constexpr Real SLOPE_LEFT = Real(0.1);                           // of the line search, as a share of the slope at its start
 
 // -- M and H, whose pattern is the tree's --
@@ -86,6 +87,11 @@ FUNCTION void solve_unrolled(Worlds& w) {
 }
 
 FUNCTION int highest(unsigned bits) { return 31 - __builtin_clz(bits); }
+FUNCTION int highest(unsigned long long bits) { return 63 - __builtin_clzll(bits); }
+FUNCTION int highest(unsigned __int128 bits) {
+  const unsigned long long high = bits >> 64, low = bits;
+  return high ? 64 + highest(high) : highest(low);
+}
 
 // The same by bits of the pattern, with the fill-in of contacts between branches. A world without such a contact has
 // zeros there, which change nothing.
@@ -94,26 +100,26 @@ FUNCTION void solve_pattern(Worlds& w) {
   for (int i = 0; i < NV; ++i) s[i] = -w.gradient[i];
   for (int k = NV - 1; k >= 0; --k) {
     const Num scale = inverse(w.H[k][k]), own = s[k];
-    for (unsigned rows = w.pattern[k]; rows;) {
+    for (Dofs rows = w.pattern[k]; rows;) {
       const int i = highest(rows);
       const Num share = w.H[k][i] * scale;
-      for (unsigned columns = rows; columns;) {
+      for (Dofs columns = rows; columns;) {
         const int j = highest(columns);
         w.H[i][j] -= share * w.H[k][j];
-        columns ^= 1u << j;
+        columns ^= Dofs(1) << j;
       }
       w.H[k][i] = share;
       s[i] -= share * own;
-      rows ^= 1u << i;
+      rows ^= Dofs(1) << i;
     }
     s[k] = own * scale;
   }
   for (int i = 0; i < NV; ++i) {
     Num x = s[i];
-    for (unsigned columns = w.pattern[i]; columns;) {
+    for (Dofs columns = w.pattern[i]; columns;) {
       const int j = highest(columns);
       x -= w.H[i][j] * s[j];
-      columns ^= 1u << j;
+      columns ^= Dofs(1) << j;
     }
     s[i] = x;
   }
@@ -122,9 +128,9 @@ FUNCTION void solve_pattern(Worlds& w) {
 // Adds to the pattern what elimination fills in.
 FUNCTION void complete_pattern(Worlds& w) {
   for (int k = NV - 1; k >= 0; --k) {
-    for (unsigned rows = w.pattern[k]; rows;) {
+    for (Dofs rows = w.pattern[k]; rows;) {
       const int i = highest(rows);
-      rows ^= 1u << i;
+      rows ^= Dofs(1) << i;
       w.pattern[i] |= rows;
     }
   }
@@ -137,29 +143,39 @@ FUNCTION void solve(Worlds& w) {
 
 // -- gradient and Hessian --
 
-// What an edge set adds: the force along the contact's axes, and the matrix between them.
+// What an edge set adds: the force along the contact's axes, and the matrix between them: the normal's own entry, those
+// of the normal with the others, and the others' own.
 struct Edges {
-  Num force[3], normal, normal_first, normal_second, first, second;
+  Num force[DIRECTIONS], normal, mixed[DIRECTIONS], own[DIRECTIONS];
 };
 
 FUNCTION void add_column(Worlds& w, const Slot& s, const Edges& e, int j, int dof, Num* along) {
-  const Num normal = s.jacobian[j][0], first = s.jacobian[j][1], second = s.jacobian[j][2];
-  w.gradient[dof] += normal * e.force[0] + first * e.force[1] + second * e.force[2];
-  along[0] = e.normal * normal + e.normal_first * first + e.normal_second * second;
-  along[1] = e.normal_first * normal + e.first * first;
-  along[2] = e.normal_second * normal + e.second * second;
+  const Num* row = s.jacobian[j];
+  Num pull = row[0] * e.force[0];
+  along[0] = e.normal * row[0];
+  for (int k = 1; k < DIRECTIONS; ++k) {
+    pull += row[k] * e.force[k];
+    along[0] += e.mixed[k] * row[k];
+    along[k] = e.mixed[k] * row[0] + e.own[k] * row[k];
+  }
+  w.gradient[dof] += pull;
+}
+
+FUNCTION Num product(const Num* a, const Num* b) {
+  Num sum = a[0] * b[0];
+  for (int k = 1; k < DIRECTIONS; ++k) sum += a[k] * b[k];
+  return sum;
 }
 
 // Contacts with N columns; where all are the root's too, its columns are the first.
 template <int N> FUNCTION void add_contact(Worlds& w, const Slot& s, const Edges& e) {
   constexpr auto known = [](int column) { return ROOTED && column < FIRST; };
   repeat<0, N>([&](auto j) INLINE {
-    Num along[3];
+    Num along[DIRECTIONS];
     const int dof = known(j) ? int(j) : s.dofs[j];
     add_column(w, s, e, j, dof, along);
     repeat<decltype(j)::value, N>([&](auto i) INLINE {
-      const Num* row = s.jacobian[i];
-      w.H[known(i) ? int(i) : s.dofs[i]][dof] += row[0] * along[0] + row[1] * along[1] + row[2] * along[2];
+      w.H[known(i) ? int(i) : s.dofs[i]][dof] += product(s.jacobian[i], along);
     });
   });
 }
@@ -174,38 +190,40 @@ FUNCTION void add_contact(Worlds& w, const Slot& s, const Edges& e) {
     return;
   }
   for (int j = 0; j < s.columns; ++j) {
-    Num along[3];
+    Num along[DIRECTIONS];
     add_column(w, s, e, j, s.dofs[j], along);
-    for (int i = j; i < s.columns; ++i) {
-      const Num* row = s.jacobian[i];
-      w.H[s.dofs[i]][s.dofs[j]] += row[0] * along[0] + row[1] * along[1] + row[2] * along[2];
-    }
+    for (int i = j; i < s.columns; ++i) w.H[s.dofs[i]][s.dofs[j]] += product(s.jacobian[i], along);
   }
 }
 
-// The residuals of the pyramid's edges: normal plus or minus a tangent.
-FUNCTION void edges_of(const Num* residual, Num* edge) {
-  edge[0] = residual[0] + residual[1], edge[1] = residual[0] - residual[1];
-  edge[2] = residual[0] + residual[2], edge[3] = residual[0] - residual[2];
+// The residuals of the pyramid's edges: normal plus or minus another axis.
+FUNCTION void edges_of(const Num* residual, int frictions, Num* edge) {
+  for (int k = 0; k < frictions; ++k) {
+    edge[2 * k] = residual[0] + residual[k + 1];
+    edge[2 * k + 1] = residual[0] - residual[k + 1];
+  }
 }
 
 FUNCTION void add_contacts(Worlds& w) {
   for (int c = 0; c < w.slot_count; ++c) {
     Slot& s = w.slots[c];
-    Num edge[4], weight[4], force[4];
-    edges_of(s.residual, edge);
-    for (int k = 0; k < 4; ++k) s.active[k] = (edge[k] < Num(0)) & s.has;
-    if (!any(s.active[0] | s.active[1] | s.active[2] | s.active[3])) continue;
-    for (int k = 0; k < 4; ++k) {
-      weight[k] = select(s.active[k], s.weight, Num(0));
-      force[k] = weight[k] * edge[k];
+    Num edge[EDGES];
+    Mask pushes = mask_of(false);
+    edges_of(s.residual, s.frictions(), edge);
+    for (int k = 0; k < 2 * s.frictions(); ++k) {
+      s.active[k] = (edge[k] < Num(0)) & s.has;
+      pushes |= s.active[k];
     }
-    const Edges e = {{force[0] + force[1] + force[2] + force[3], force[0] - force[1], force[2] - force[3]},
-                     weight[0] + weight[1] + weight[2] + weight[3],
-                     weight[0] - weight[1],
-                     weight[2] - weight[3],
-                     weight[0] + weight[1],
-                     weight[2] + weight[3]};
+    if (!any(pushes)) continue;
+    Edges e;
+    e.normal = e.force[0] = Num(0);
+    for (int k = 1; k < DIRECTIONS; ++k) e.force[k] = e.mixed[k] = e.own[k] = Num(0);
+    for (int k = 1; k <= s.frictions(); ++k) {
+      const Num first = select(s.active[2 * k - 2], s.weight, Num(0)), up = first * edge[2 * k - 2];
+      const Num second = select(s.active[2 * k - 1], s.weight, Num(0)), down = second * edge[2 * k - 1];
+      e.normal += first + second, e.force[0] += up + down;
+      e.mixed[k] = first - second, e.own[k] = first + second, e.force[k] = up - down;
+    }
     add_contact(w, s, e);
   }
 }
@@ -228,15 +246,15 @@ FUNCTION Mask change_residuals(Worlds& w) {
   Mask changed = mask_of(false);
   for (int c = 0; c < w.slot_count; ++c) {
     Slot& s = w.slots[c];
-    Num after[3], edge[4];
-    for (int x = 0; x < 3; ++x) s.change[x] = Num(0);
+    Num after[DIRECTIONS], edge[EDGES];
+    for (int x = 0; x < DIRECTIONS; ++x) s.change[x] = Num(0);
     for (int k = 0; k < s.columns; ++k) {
       const Num step = w.step[s.dofs[k]];
-      for (int x = 0; x < 3; ++x) s.change[x] += s.jacobian[k][x] * step;
+      for (int x = 0; x < DIRECTIONS; ++x) s.change[x] += s.jacobian[k][x] * step;
     }
-    for (int x = 0; x < 3; ++x) after[x] = s.residual[x] + s.change[x];
-    edges_of(after, edge);
-    for (int k = 0; k < 4; ++k) changed |= s.has & differ(edge[k] < Num(0), s.active[k]);
+    for (int x = 0; x < DIRECTIONS; ++x) after[x] = s.residual[x] + s.change[x];
+    edges_of(after, s.frictions(), edge);
+    for (int k = 0; k < 2 * s.frictions(); ++k) changed |= s.has & differ(edge[k] < Num(0), s.active[k]);
   }
   for (int n = 0; n < w.limit_count; ++n) {
     const int k = w.limits[n];
@@ -256,11 +274,11 @@ FUNCTION void add_edge(Num residual, Num change, Num weight, Num* slope, Num* cu
 FUNCTION void constraint_slope(const Worlds& w, Num alpha, Num* slope, Num* curvature) {
   for (int c = 0; c < w.slot_count; ++c) {
     const Slot& s = w.slots[c];
-    Num residual[3], edge[4], change[4];
-    for (int x = 0; x < 3; ++x) residual[x] = s.residual[x] + alpha * s.change[x];
-    edges_of(residual, edge);
-    edges_of(s.change, change);
-    for (int k = 0; k < 4; ++k) add_edge(edge[k], change[k], s.weight, slope, curvature);
+    Num residual[DIRECTIONS], edge[EDGES], change[EDGES];
+    for (int x = 0; x < DIRECTIONS; ++x) residual[x] = s.residual[x] + alpha * s.change[x];
+    edges_of(residual, s.frictions(), edge);
+    edges_of(s.change, s.frictions(), change);
+    for (int k = 0; k < 2 * s.frictions(); ++k) add_edge(edge[k], change[k], s.weight, slope, curvature);
   }
   for (int n = 0; n < w.limit_count; ++n) {
     const int k = w.limits[n];
@@ -299,7 +317,7 @@ FUNCTION Num line_search(Worlds& w, Num alpha, Num slope_at_start, Mask on) {
 FUNCTION void move(Worlds& w, Num alpha, Mask todo, bool residuals_of_contacts, bool residuals_of_limits) {
   for (int i = 0; i < NV; ++i) w.a[i] = select(todo, w.a[i] + alpha * w.step[i], w.a[i]);
   for (int c = 0; c < w.slot_count && residuals_of_contacts; ++c) {
-    for (int x = 0; x < 3; ++x) w.slots[c].residual[x] += alpha * w.slots[c].change[x];
+    for (int x = 0; x < DIRECTIONS; ++x) w.slots[c].residual[x] += alpha * w.slots[c].change[x];
   }
   for (int n = 0; n < w.limit_count && residuals_of_limits; ++n) {
     w.limit_residual[w.limits[n]] += alpha * w.limit_change[w.limits[n]];

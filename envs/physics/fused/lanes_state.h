@@ -4,7 +4,8 @@
 #include MODEL
 
 constexpr int FIRST = HAS_FREE ? 6 : 0;  // degree of freedom of the first joint
-constexpr int CANDIDATES = NPOINTS + 2 * NPAIRS;
+constexpr int CORNERS = 8;  // of a box, and the most contacts of two boxes
+constexpr int CANDIDATES = NPOINTS + 2 * (NPAIRS - NBOX_PAIRS) + CORNERS * NBOX_PAIRS;
 constexpr int MOST_SLOTS = CANDIDATES < MOST_CONTACTS * LANES ? CANDIDATES : MOST_CONTACTS * LANES;
 // Loops over small trees are unrolled, so that indices are constants and small arrays stay in registers.
 constexpr bool UNROLLED = NV <= 16 && !FILLS;
@@ -15,11 +16,14 @@ constexpr bool reads(int field) {
   }
   return false;
 }
-constexpr int NSEGMENT_PAIRS = NPAIRS - NBLOCK_PAIRS;  // those of two segments are the first
+constexpr int NSEGMENT_PAIRS = NPAIRS - NBLOCK_PAIRS - NBOX_PAIRS;  // they are the first, those of two boxes the last
 constexpr bool FLUID = NBOXES > 0;
 constexpr bool READS_FORCES = reads(CFRC_EXT);
 
 constexpr int at_least_one(int size) { return size > 0 ? size : 1; }
+
+template <bool FIRST, class A, class B> struct Chosen { typedef A type; };
+template <class A, class B> struct Chosen<false, A, B> { typedef B type; };
 
 template <int I> struct Index {
   static constexpr int value = I;
@@ -32,27 +36,32 @@ template <int FROM, int TO, class Body> FUNCTION void repeat(const Body& body) {
   }
 }
 
-// A contact's place and axes: the normal, and both tangents times friction.
+// A contact's place and axes: the normal, and both tangents times friction; the axes of spin and rolling, times theirs.
 struct Frame {
-  Vec3 place, axes[3];
+  Vec3 place, axes[DIRECTIONS];
 };
+
+typedef Chosen<(NV > 64), unsigned __int128, unsigned long long>::type WideDofs;
+typedef Chosen<(NV > 32), WideDofs, unsigned>::type Dofs;  // a bit for each
 
 // A contact that at least one world has.
 struct Slot {
-  Num jacobian[MOST_COLUMNS][3];  // of the frame's axes, by the degrees of freedom in `dofs`
-  Num weight;                     // D of each of the four edges; 0 in worlds without the contact
-  Num residual[3];                // acceleration along the axes, less the reference's
-  Num change[3];                  // of it by a full Newton step
-  Mask has, active[4];            // edges whose residual is negative
+  Num jacobian[MOST_COLUMNS][DIRECTIONS];  // of the frame's axes, by the degrees of freedom in `dofs`
+  Num weight;                              // D of each edge; 0 in worlds without the contact
+  Num residual[DIRECTIONS];                // acceleration along the axes, less the reference's
+  Num change[DIRECTIONS];                  // of it by a full Newton step
+  Mask has, active[2 * (DIRECTIONS - 1)];  // edges whose residual is negative: two for each axis after the normal
   Frame frame;                    // for the forces on bodies
   const int* dofs;
-  int columns, place1, place2;
+  int columns, place1, place2, dims;
+  MEMBER int frictions() const { return DIRECTIONS == 3 ? 2 : dims - 1; }  // axes after the normal
 };
 
 struct alignas(64) Worlds {
   // The state and its integration.
   Num qpos[NQ], qvel[NV], start_qpos[NQ], start_qvel[NV], mean_velocity[NV], mean_acceleration[NV];
-  Num acceleration[NV], motor[NV];
+  Num acceleration[NV], motor[NV], warmstart[NV];
+  Num drive[at_least_one(NU)];  // forces of actuators by their controls
   // The frame of the base, in which all below is.
   World world;
   Mat3 attitude;     // of the base in the world
@@ -73,7 +82,7 @@ struct alignas(64) Worlds {
   Num limit_weight[at_least_one(NLIMITS)], limit_residual[at_least_one(NLIMITS)];
   Num limit_change[at_least_one(NLIMITS)], limit_sign[at_least_one(NLIMITS)];
   Mask limit_active[at_least_one(NLIMITS)];
-  unsigned pattern[NV];  // H's entries below the diagonal, a bit each, where contacts fill it
+  Dofs pattern[NV];  // H's entries below the diagonal, a bit each, where contacts fill it
   // What leaves.
   Num contacts, overflow;
   Num out[at_least_one(WIDTH)];

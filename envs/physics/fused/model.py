@@ -1,11 +1,11 @@
 """Tables of a compiled MjModel that the fused step is generated from, and what it cannot step.
 
-The step knows a tree of slides and hinges on the world or on one free root; spheres and capsules that touch horizontal
-planes, boxes and one another; pyramidal cones, limits, springs, damping, fluid by inertia boxes; Euler and RK4.
-Nothing here depends on the robot.
+The step knows trees of slides, hinges and free joints; spheres, capsules and boxes that touch horizontal planes and one
+another; pyramidal cones of all sizes, limits, springs, damping, fluid by inertia boxes; motors of joints and at sites;
+Euler and RK4. Nothing here depends on the robot.
 
-Bodies without joints are lumped into the moving body they are welded to. Moving body 0 is the base: the free root, or
-the world. All places and axes below are in the frame of a moving body.
+Bodies without joints are lumped into the moving body they are welded to. Moving body 0 is the base: the free root, if
+all hangs on one, else the world. All places and axes below are in the frame of a moving body.
 
 Formulas are those of MuJoCo 3.17's C sources: engine_core_constraint.c (`mj_makeImpedance`, `mj_diagApprox`),
 engine_collision_driver.c (`mj_contactParam`, filters), engine_passive.c (`mj_inertiaBoxFluidModel`).
@@ -26,17 +26,19 @@ import numpy as np
 if TYPE_CHECKING:
     from ..contract import Readout
 
-MOST_DOFS = 32
+MOST_DOFS = 128
 MOST_CONTACTS = 64  # of one world at a time, unless it can never have more
 
 _MINVAL = 1e-15  # mjMINVAL
 _MINIMP, _MAXIMP = 1e-4, 0.9999  # mjMINIMP, mjMAXIMP
 _MINMU = 1e-5  # mjMINMU
+CORNERS = 8  # of a box, and the most contacts of two boxes
 
 _FREE, _BALL, _SLIDE, _HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{x}")) for x in ("FREE", "BALL", "SLIDE", "HINGE"))
 _PLANE, _SPHERE, _CAPSULE, _BOX = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("PLANE", "SPHERE", "CAPSULE", "BOX")
 )
+_AT_JOINT, _AT_SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 _EULER, _RK4 = int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4)
 _Disable = mujoco.mjtDisableBit
 # What these switch off is computed here in no other way: searches for islands and for colliding boxes.
@@ -54,7 +56,9 @@ FIELDS = {
     "cvel": 6,
     "cfrc_ext": 6,
     "qfrc_actuator": 1,
+    "qacc": 1,
 }
+_OF_DOFS = ("qfrc_actuator", "qacc")  # fields with a row for a degree of freedom, not for a body
 
 
 class Impedance(NamedTuple):
@@ -77,13 +81,17 @@ class Contact(NamedTuple):
     """Parameters of a contact between two geoms.
 
     Attributes:
-      friction: mu of both tangents; 0 of a frictionless contact, whose row is four equal edges of a quarter each.
+      dims: 3, 4 or 6 directions: the normal and both tangents; spin about the normal; rolling about both tangents. The
+        pyramid has two edges for each but the normal.
+      friction: [5], mu of the directions after the normal; 0 of a frictionless contact, whose row is four equal edges
+        of a quarter each.
       margin: m, a contact exists up to this distance.
       impedance: see `Impedance`.
-      regularisation: R of each of the four edges is this times (1 - imp) / imp.
+      regularisation: R of each edge is this times (1 - imp) / imp.
     """
 
-    friction: float
+    dims: int
+    friction: tuple[float, ...]
     margin: float
     impedance: Impedance
     regularisation: float
@@ -110,22 +118,25 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A slide or a hinge, in the order of the tree. The free root has none: its frame is that of everything.
+    """A slide, a hinge or a free joint, in the order of the tree.
+
+    A base that is a free root has none: its frame is that of everything.
 
     A body's frame is its parent's, then for each of its joints: moved to `anchor` (a slide: moved on along `axis`),
-    turned about `axis` (a hinge), turned by `rotation`, moved back by `position`.
+    turned about `axis` (a hinge), turned by `rotation`, moved back by `position`. A free joint's frame is its qpos.
 
     Attributes:
-      hinge: a hinge, else a slide.
+      hinge: a hinge. free: a free joint; else a slide.
       shift: a slide along the floor that everything hangs on: only readouts of places depend on its qpos.
       body: moving body that it moves.
-      qpos, dof: addresses.
+      qpos, dof: addresses; of the first of a free joint's.
       reference: qpos0.
       axis, anchor: [3] in the frame before it. position: [3] of the anchor in the frame behind it; 0 of a slide.
       rotation, quat: [3, 3] and [4], the fixed turn of the body against its parent; identity but of its first joint.
     """
 
     hinge: bool
+    free: bool
     shift: bool
     body: int
     qpos: int
@@ -177,16 +188,19 @@ class FluidBox:
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A sphere, or an end of a capsule, over a horizontal plane of the world.
+    """A sphere, an end of a capsule or a corner of a box, over a horizontal plane of the world.
 
     Attributes:
       body: moving body. place: body of the MjModel, for forces on it.
-      centre: [3] m. axis: [3], the capsule's, which the first tangent follows; 0 of a sphere.
+      corner: 1 to 8 of a box's corners, which follow one another; else 0.
+      centre: [3] m.
+      axis: [3], a capsule's, which the first tangent follows; m, from the middle of a corner's box; 0 of a sphere.
       radius: m. height: m, the plane's. contact: see `Contact`.
     """
 
     body: int
     place: int
+    corner: int
     centre: np.ndarray
     axis: np.ndarray
     radius: float
@@ -210,10 +224,15 @@ class Segment:
     side: np.ndarray
     radius: float
 
+    @property
+    def extent(self) -> float:
+        """m, from its middle to where it is furthest."""
+        return self.radius + _length(self.half)
+
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A box that segments may touch.
+    """A box that segments or other boxes may touch.
 
     Attributes:
       body: moving body; -1 for the world where the base is a free root. place: body of the MjModel, for forces on it.
@@ -228,14 +247,19 @@ class Block:
     size: np.ndarray
     reach: float
 
+    @property
+    def extent(self) -> float:
+        """m, from its middle to a corner."""
+        return _length(self.size)
+
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two segments, or a box and a segment, that may touch.
+    """Two segments, a box and a segment, or two boxes that may touch.
 
     Attributes:
       first, second: indices into `Tables.segments`, in MuJoCo's order: the normal points from the first to the second.
-      with_block: the first is an index into `Tables.blocks`.
+      blocks: how many are boxes: the first, or both, are indices into `Tables.blocks`.
       rooted: the free root's dofs are among `dofs`.
       dofs: degrees of freedom that move one of the two only, ascending.
       signs: 1 where a dof moves the second, -1 where it moves the first.
@@ -244,7 +268,7 @@ class Pair:
 
     first: int
     second: int
-    with_block: bool
+    blocks: int
     rooted: bool
     dofs: tuple[int, ...]
     signs: tuple[int, ...]
@@ -268,13 +292,38 @@ class Limit(NamedTuple):
     inverse_weight: float
 
 
-class Motor(NamedTuple):
-    """An actuator: force on `dof` is gain times the control, clipped to low and high."""
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """An actuator: a force along a joint or at a site.
+
+    Attributes:
+      dof: of its joint, or -1. gear: the joint's share of the force.
+      qpos: of its joint, on whose place the force may depend; -1 of a site.
+      body: moving body of its site, else 0. place: [3] m, the site's. push, turn: [3] each, per unit of the force, the
+        force and the moment there; 0 of a joint.
+      gain: times the control, clipped to low and high.
+      bias: [3], added to it: a constant, times the joint's place, times the speed along `gear` or `push` and `turn`.
+      weakest, strongest: what the sum is clipped to.
+    """
 
     dof: int
+    gear: float
+    qpos: int
+    body: int
+    place: np.ndarray
+    push: np.ndarray
+    turn: np.ndarray
     gain: float
     low: float
     high: float
+    bias: tuple[float, float, float]
+    weakest: float
+    strongest: float
+
+    @property
+    def plain(self) -> bool:
+        """Whether its force depends on the control alone."""
+        return self.dof >= 0 and not any(self.bias) and bool(np.isinf(self.weakest) and np.isinf(self.strongest))
 
 
 class Reading(NamedTuple):
@@ -302,7 +351,10 @@ class Tables:
       has_free: moving body 0 is a free root with dofs 0 to 5 (world axes, then the root's); else it is the world.
       bodies, joints, places: see their classes. Bodies and joints: parents first.
       boxes: of a fluid; empty without. density: kg/m3. viscosity: Pa s.
-      points, segments, blocks, pairs, limits, motors: see their classes. Pairs: those with blocks last, block by block.
+      forward: after the substeps, a forward pass at the new state, to which the readouts belong.
+      points, segments, blocks, pairs, limits, motors: see their classes. Pairs: of segments, then those with a block,
+        block by block, then of two blocks.
+      directions: 3, or 6 if a contact has more than 3.
       ancestors: for each dof those before it on its chain, descending: M's pattern below the diagonal.
       fills: a pair's contact couples dofs that M does not.
       most_contacts: of one world at a time; one with more reports `overflow`.
@@ -316,6 +368,7 @@ class Tables:
     nu: int
     nbody: int
     substeps: int
+    forward: bool
     timestep: float
     rk4: bool
     gravity: float
@@ -335,6 +388,7 @@ class Tables:
     pairs: tuple[Pair, ...]
     limits: tuple[Limit, ...]
     motors: tuple[Motor, ...]
+    directions: int
     ancestors: tuple[tuple[int, ...], ...]
     fills: bool
     most_contacts: int
@@ -356,12 +410,15 @@ class Tables:
         return all(pair.rooted for pair in self.pairs)
 
     def reach(self, pair: Pair) -> float:
-        """m, between the middles of two segments, or a segment's and a box: further apart they cannot touch."""
-        both = [self.segments[k] for k in ((pair.second,) if pair.with_block else (pair.first, pair.second))]
-        return pair.contact.margin + sum(s.radius + float(np.linalg.norm(s.half)) for s in both)
+        """m, between the middles of two, or a segment's and a box: further apart they cannot touch."""
+        first = 0.0 if pair.blocks == 1 else (self.blocks if pair.blocks else self.segments)[pair.first].extent
+        second = (self.blocks if pair.blocks == 2 else self.segments)[pair.second].extent
+        return pair.contact.margin + first + second
 
 
-def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None) -> Tables:
+def tables(
+    model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int | None = None, forward: bool = False
+) -> Tables:
     """The tables of a model without an `obstacle`; `contacts` of one world at a time, derived if None."""
     m = model
     tree = _Tree(m)
@@ -376,6 +433,7 @@ def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int
         nu=m.nu,
         nbody=m.nbody,
         substeps=substeps,
+        forward=forward,
         timestep=float(m.opt.timestep),
         rk4=int(m.opt.integrator) == _RK4,
         gravity=-float(m.opt.gravity[2]),
@@ -394,10 +452,11 @@ def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int
         blocks=blocks,
         pairs=pairs,
         limits=tuple(_limits(m)),
-        motors=tuple(_motors(m)),
+        motors=tuple(_motors(m, tree)),
+        directions=6 if any(x.contact.dims > 3 for x in (*points, *pairs)) else 3,
         ancestors=tuple(_ancestors(d, chains) for d in range(m.nv)),
         fills=any(_fills(pair.dofs, chains) for pair in pairs),
-        most_contacts=contacts or max(1, min(MOST_CONTACTS, len(points) + 2 * len(pairs))),
+        most_contacts=contacts or max(1, min(MOST_CONTACTS, len(points) + sum(_most_of(pair) for pair in pairs))),
         armature=np.array(m.dof_armature),
         damping=np.array(m.dof_damping),
         stiffness=stiffness,
@@ -405,6 +464,11 @@ def tables(model: mujoco.MjModel, substeps: int, readout: Readout, contacts: int
         qpos_of_dof=qpos_of_dof,
         readings={name: _reading(m, field, index) for name, (field, index) in readout.items()},
     )
+
+
+def _most_of(pair: Pair) -> int:
+    """Contacts that a pair has at a time."""
+    return CORNERS if pair.blocks == 2 else 2
 
 
 # -- the tree --
@@ -415,7 +479,7 @@ class _Tree:
 
     def __init__(self, m: mujoco.MjModel):
         self._m = m
-        self.has_free = m.njnt > 0 and m.jnt_type[0] == _FREE
+        self.has_free = _on_one_root(m)
         self.moving = [] if self.has_free else [0]  # bodies of the MjModel
         self.joints: list[Joint] = []
         self.places: list[Place] = []
@@ -468,7 +532,9 @@ class _Tree:
         """Adds the joints of body `b`, whose frame is at `position` of moving body `parent`."""
         m = self._m
         for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]):
-            hinge = bool(m.jnt_type[j] == _HINGE)
+            hinge, free = bool(m.jnt_type[j] == _HINGE), bool(m.jnt_type[j] == _FREE)
+            if free:  # its qpos is all that counts
+                position, rotation, quat = np.zeros(3), np.eye(3), np.array([1.0, 0, 0, 0])
             at = np.array(m.jnt_pos[j]) if hinge else np.zeros(3)
             axis = rotation @ m.jnt_axis[j]
             # Only the first bodies' first slides shift all that has mass; a static geom to touch would stay behind.
@@ -476,7 +542,10 @@ class _Tree:
             self.joints.append(
                 Joint(
                     hinge=hinge,
-                    shift=bool(not hinge and alone and abs(axis[2]) < 1e-12 and (rotation == np.eye(3)).all()),
+                    free=free,
+                    shift=bool(
+                        not hinge and not free and alone and abs(axis[2]) < 1e-12 and (rotation == np.eye(3)).all()
+                    ),
                     body=len(self.moving),
                     qpos=int(m.jnt_qposadr[j]),
                     dof=int(m.jnt_dofadr[j]),
@@ -505,7 +574,7 @@ class _Tree:
 
     def _chains(self, parents: list[int]) -> list[tuple[int, ...]]:
         root = range(6 if self.has_free else 0)
-        own = [[joint.dof for joint in self.joints if joint.body == k] for k in range(len(self.moving))]
+        own = [[d for j in self.joints if j.body == k for d in dofs_of(j)] for k in range(len(self.moving))]
         return [
             tuple(sorted([*root, *(dof for a in self._above(k, parents) for dof in own[a])]))
             for k in range(len(self.moving))
@@ -525,6 +594,26 @@ class _Tree:
         com = sum((p.mass * p.com for p in parts), np.zeros(3)) / mass
         inertia = sum((p.inertia + p.mass * _parallel(p.com - com) for p in parts), np.zeros((3, 3)))
         return mass, com, inertia
+
+
+def dofs_of(joint: Joint) -> range:
+    """The degrees of freedom of a joint."""
+    return range(joint.dof, joint.dof + (6 if joint.free else 1))
+
+
+def _on_one_root(m: mujoco.MjModel) -> bool:
+    """Whether a free root carries all that moves, so that its frame can be the base's.
+
+    Not if a motor acts at a site, which may be on the root, nor if two geoms may touch of which one is fixed and is
+    neither a plane nor a box that spheres and capsules touch.
+    """
+    if not m.njnt or m.jnt_type[0] != _FREE or m.ntree > 1 or np.any(m.actuator_trntype != _AT_JOINT):
+        return False
+    for g, h in collisions(m):
+        fixed = [m.body_weldid[m.geom_bodyid[x]] == 0 for x in (g, h)]
+        if m.geom_type[g] != _PLANE and (fixed[0] or fixed[1] and (m.geom_type[h] != _BOX or m.geom_type[g] == _BOX)):
+            return False
+    return True
 
 
 def _parallel(offset: np.ndarray) -> np.ndarray:
@@ -571,16 +660,39 @@ def _limits(m: mujoco.MjModel) -> Iterator[Limit]:
             yield Limit(int(m.jnt_qposadr[j]), dof, low, high, margin, impedance, weight)
 
 
-def _motors(m: mujoco.MjModel) -> Iterator[Motor]:
+def _motors(m: mujoco.MjModel, tree: _Tree) -> Iterator[Motor]:
     for a in range(m.nu):
         low, high = map(float, m.actuator_ctrlrange[a]) if m.actuator_ctrllimited[a] else (-np.inf, np.inf)
-        gain = float(m.actuator_gainprm[a, 0] * m.actuator_gear[a, 0])
-        yield Motor(int(m.jnt_dofadr[m.actuator_trnid[a, 0]]), gain, low, high)
+        weakest, strongest = map(float, m.actuator_forcerange[a]) if m.actuator_forcelimited[a] else (-np.inf, np.inf)
+        biased = m.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        constant, of_place, of_speed = map(float, m.actuator_biasprm[a, :3] if biased else np.zeros(3))
+        target, at_joint = int(m.actuator_trnid[a, 0]), m.actuator_trntype[a] == _AT_JOINT
+        body, place, push, turn = 0, np.zeros(3), np.zeros(3), np.zeros(3)
+        if not at_joint:
+            on = tree.places[m.site_bodyid[target]]
+            axes = on.rotation @ _matrix(m.site_quat[target])
+            body, place = on.body, on.position + on.rotation @ m.site_pos[target]
+            push, turn = axes @ m.actuator_gear[a, :3], axes @ m.actuator_gear[a, 3:]
+        yield Motor(
+            dof=int(m.jnt_dofadr[target]) if at_joint else -1,
+            gear=float(m.actuator_gear[a, 0]) if at_joint else 0.0,
+            qpos=int(m.jnt_qposadr[target]) if at_joint else -1,
+            body=body,
+            place=place,
+            push=push,
+            turn=turn,
+            gain=float(m.actuator_gainprm[a, 0]),
+            low=low,
+            high=high,
+            bias=(constant, of_place, of_speed),
+            weakest=weakest,
+            strongest=strongest,
+        )
 
 
 def _reading(m: mujoco.MjModel, field: str, index: object) -> Reading:
-    rows = np.arange(m.nv if field == "qfrc_actuator" else m.nbody)[index]
-    row = {"qfrc_actuator": ()}.get(field, (FIELDS[field],))
+    rows = np.arange(m.nv if field in _OF_DOFS else m.nbody)[index]
+    row = () if field in _OF_DOFS else (FIELDS[field],)
     return Reading(field, tuple(int(r) for r in rows.reshape(-1)), (*rows.shape, *row))
 
 
@@ -610,16 +722,18 @@ def contact_of(m: mujoco.MjModel, first: int, second: int) -> Contact:
     weight = float(sum(m.body_invweight0[m.geom_bodyid[g], 0] for g in (first, second)))
     impedance = impedance_of(m, solref, solimp)
     if condim == 1:
-        return Contact(0.0, margin, impedance, 4.0 * weight)
-    mu = max(friction, _MINMU)
-    return Contact(mu, margin, impedance, 2.0 * mu**2 * weight * (1.0 + mu**2))
+        return Contact(3, (0.0,) * 5, margin, impedance, 4.0 * weight)
+    slide, spin, roll = np.maximum(friction, _MINMU).tolist()
+    mu = (slide, slide, spin, roll, roll)[: condim - 1]
+    regularisation = 2.0 * slide**2 * weight * (1.0 + slide**2)  # all edges have that of the first
+    return Contact(condim, (*mu, *(0.0,) * (5 - len(mu))), margin, impedance, regularisation)
 
 
-def _mixed(m: mujoco.MjModel, g: int, h: int) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """condim, friction, solref and solimp of two geoms."""
+def _mixed(m: mujoco.MjModel, g: int, h: int) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """condim, friction [3] (sliding, spinning, rolling), solref and solimp of two geoms."""
     if m.geom_priority[g] != m.geom_priority[h]:
         geom = g if m.geom_priority[g] > m.geom_priority[h] else h
-        return int(m.geom_condim[geom]), float(m.geom_friction[geom, 0]), m.geom_solref[geom], m.geom_solimp[geom]
+        return int(m.geom_condim[geom]), m.geom_friction[geom], m.geom_solref[geom], m.geom_solimp[geom]
     first, second = (float(m.geom_solmix[x]) for x in (g, h))
     if first >= _MINVAL and second >= _MINVAL:
         mix = first / (first + second)
@@ -630,7 +744,7 @@ def _mixed(m: mujoco.MjModel, g: int, h: int) -> tuple[int, float, np.ndarray, n
         solref = np.minimum(m.geom_solref[g], m.geom_solref[h])
     solimp = mix * m.geom_solimp[g] + (1.0 - mix) * m.geom_solimp[h]
     condim = int(max(m.geom_condim[g], m.geom_condim[h]))
-    return condim, float(max(m.geom_friction[g, 0], m.geom_friction[h, 0])), solref, solimp
+    return condim, np.maximum(m.geom_friction[g], m.geom_friction[h]), solref, solimp
 
 
 def collisions(m: mujoco.MjModel) -> Iterator[tuple[int, int]]:
@@ -652,34 +766,47 @@ def _points(m: mujoco.MjModel, tree: _Tree) -> Iterator[Point]:
     for plane, geom in collisions(m):
         if m.geom_type[plane] != _PLANE:
             continue
+        height, contact = float(_in_world(m, tree, plane)[2]), contact_of(m, plane, geom)
+        if m.geom_type[geom] == _BOX:
+            yield from _corners(m, tree, geom, height, contact)
+            continue
         segment = _segment(m, tree, geom)
         capsule = m.geom_type[geom] == _CAPSULE
         axis = segment.half / np.linalg.norm(segment.half) if capsule else np.zeros(3)
-        height = float(_in_world(m, tree, plane)[2])
         for side in (1, -1) if capsule else (0,):
             centre = segment.centre + side * segment.half
-            contact = contact_of(m, plane, geom)
-            yield Point(segment.body, segment.place, centre, axis, segment.radius, height, contact)
+            yield Point(segment.body, segment.place, 0, centre, axis, segment.radius, height, contact)
+
+
+def _corners(m: mujoco.MjModel, tree: _Tree, geom: int, height: float, contact: Contact) -> Iterator[Point]:
+    """A box over a plane, in the order of `mjc_PlaneBox`."""
+    b = int(m.geom_bodyid[geom])
+    place = tree.places[b]
+    middle, axes = place.position + place.rotation @ m.geom_pos[geom], place.rotation @ _matrix(m.geom_quat[geom])
+    for k in range(CORNERS):
+        offset = axes @ (m.geom_size[geom] * [1 if k >> x & 1 else -1 for x in range(3)])
+        yield Point(place.body, b, k + 1, middle + offset, offset, 0.0, height, contact)
 
 
 def _pairs(m: mujoco.MjModel, tree: _Tree) -> tuple[tuple[Segment, ...], tuple[Block, ...], tuple[Pair, ...]]:
     found = [pair for pair in collisions(m) if m.geom_type[pair[0]] != _PLANE]
-    boxes = sorted({pair[1] for pair in found if m.geom_type[pair[1]] == _BOX})
+    boxes = sorted({geom for pair in found for geom in pair if m.geom_type[geom] == _BOX})
     # A box comes first, where MuJoCo has it second: a pyramid's edges are the same from either side.
-    found = [pair if pair[1] not in boxes else pair[::-1] for pair in found]
-    found.sort(key=lambda pair: boxes.index(pair[0]) if pair[0] in boxes else -1)
+    found = [pair[::-1] if pair[1] in boxes and pair[0] not in boxes else pair for pair in found]
+    count = {pair: (pair[0] in boxes) + (pair[1] in boxes) for pair in found}
+    found.sort(key=lambda pair: (count[pair], boxes.index(pair[0]) if count[pair] else -1))
     geoms = sorted({geom for pair in found for geom in pair if geom not in boxes})
     segments = tuple(_segment(m, tree, geom) for geom in geoms)
-    blocks = tuple(_block(m, tree, box, [segments[geoms.index(g)] for b, g in found if b == box]) for box in boxes)
+    touching = {box: [segments[geoms.index(g)] for b, g in found if b == box and g not in boxes] for box in boxes}
+    blocks = tuple(_block(m, tree, box, touching[box]) for box in boxes)
     pairs = []
     for pair in found:
-        with_block = pair[0] in boxes
-        first, second = (boxes if with_block else geoms).index(pair[0]), geoms.index(pair[1])
-        bodies = (blocks if with_block else segments)[first].body, segments[second].body
+        first, second = ((boxes if geom in boxes else geoms).index(geom) for geom in pair)
+        bodies = [tree.places[m.geom_bodyid[geom]].body for geom in pair]
         chains = [set(tree.bodies[body].chain) if body >= 0 else set() for body in bodies]
         dofs = tuple(sorted(chains[0] ^ chains[1]))
         signs = tuple(1 if dof in chains[1] else -1 for dof in dofs)
-        pairs.append(Pair(first, second, with_block, bodies[0] < 0, dofs, signs, contact_of(m, *pair)))
+        pairs.append(Pair(first, second, count[pair], bodies[0] < 0, dofs, signs, contact_of(m, *pair)))
     return segments, blocks, tuple(pairs)
 
 
@@ -789,8 +916,8 @@ def _refused_joints(m: mujoco.MjModel) -> Iterator[str]:
         kind = m.jnt_type[j]
         if kind == _BALL:
             yield f"joint '{m.joint(j).name}' is a ball joint"
-        if kind == _FREE and (j or m.ntree > 1 or m.jnt_stiffness[j]):
-            yield "it has a free joint beside other trees, or one with a spring"
+        if kind == _FREE and m.jnt_stiffness[j]:
+            yield "it has a free joint with a spring"
         impedance = (m.jnt_solref[j], m.jnt_solimp[j])
         if m.jnt_limited[j] and (not _plain(*impedance) or np.ptp(m.jnt_range[j]) <= 2 * m.jnt_margin[j]):
             yield f"joint '{m.joint(j).name}' has unusual limits (solref, solimp, or both active at once)"
@@ -802,39 +929,36 @@ def _plain(solref: np.ndarray, solimp: np.ndarray) -> bool:
 
 
 def _refused_motors(m: mujoco.MjModel) -> Iterator[str]:
-    joint = m.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    plain = m.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
-    plain &= m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE)
-    special = m.actuator_forcelimited.astype(bool)
+    at_site = m.actuator_trntype == _AT_SITE
+    plain = (m.actuator_trntype == _AT_JOINT) | at_site & (m.actuator_trnid[:, 1] < 0)
+    plain &= m.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    plain &= np.isin(m.actuator_biastype, [int(x) for x in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)])
+    special = np.zeros(m.nu, bool)
     for array in ("actuator_damping", "actuator_dampingpoly", "actuator_armature"):
         values = np.asarray(getattr(m, array, np.zeros(m.nu)))
         special = special | (values.reshape(m.nu, -1) != 0).any(1) if m.nu else special
     for a in range(m.nu):
         name = m.actuator(a).name or a
-        if not (joint[a] and plain[a]) or special[a] or m.nactuator != m.nu:
-            yield f"actuator '{name}' is no plain motor of a joint"
-        elif m.jnt_type[m.actuator_trnid[a, 0]] not in (_SLIDE, _HINGE):
+        if not plain[a] or special[a] or m.nactuator != m.nu:
+            yield f"actuator '{name}' is no motor, position or speed servo of a joint or at a site"
+        elif not at_site[a] and m.jnt_type[m.actuator_trnid[a, 0]] not in (_SLIDE, _HINGE):
             yield f"actuator '{name}' drives a free joint"
 
 
 def _refused_contacts(m: mujoco.MjModel) -> Iterator[str]:
-    base = m.njnt and m.jnt_type[0] == _FREE
+    solids = (_SPHERE, _CAPSULE, _BOX)
     for g, h in collisions(m):
         names = " and ".join(f"'{m.geom(x).name or x}'" for x in (g, h))
         types = [int(m.geom_type[x]) for x in (g, h)]
         plane = types[0] == _PLANE
-        known = (_SPHERE, _CAPSULE)
-        if not ((plane or types[0] in known) and types[1] in known or types[0] in known and types[1] == _BOX):
+        if not (plane or types[0] in solids) or types[1] not in solids:
             kinds = " and ".join(mujoco.mjtGeom(t).name.removeprefix("mjGEOM_").lower() for t in types)
-            yield f"geoms {names} may touch ({kinds}); it knows spheres and capsules on planes, boxes and each other"
-        static = [m.body_weldid[m.geom_bodyid[x]] == 0 for x in (g, h)]
-        if plane and not (static[0] and _upright(m, g)):
+            yield f"geoms {names} may touch ({kinds}); it knows spheres, capsules and boxes, on planes and each other"
+        if plane and not (m.body_weldid[m.geom_bodyid[g]] == 0 and _upright(m, g)):
             yield f"plane {names.split(' and ')[0]} moves or is not horizontal"
-        if not plane and base and (static[0] or static[1] and types[1] != _BOX):
-            yield f"geoms {names} may touch, and a sphere or capsule of them is fixed to the world"
-        condim, _, solref, solimp = _mixed(m, g, h)
-        if condim not in (1, 3) or not _plain(solref, solimp):
-            yield f"geoms {names} touch with condim {condim}, or with an unusual solref or solimp"
+        _, _, solref, solimp = _mixed(m, g, h)
+        if not _plain(solref, solimp):
+            yield f"geoms {names} touch with an unusual solref or solimp"
 
 
 def _upright(m: mujoco.MjModel, geom: int) -> bool:
@@ -850,7 +974,7 @@ def _refused_readouts(m: mujoco.MjModel, readout: Readout) -> Iterator[str]:
         if field not in FIELDS:
             yield f"readout '{name}' is {field}; it knows {', '.join(FIELDS)}"
             continue
-        rows = [] if field == "qfrc_actuator" else _reading(m, field, index).rows
+        rows = [] if field in _OF_DOFS else _reading(m, field, index).rows
         if field == "subtree_com" and not all(m.body_jntnum[row] for row in rows):
             yield f"readout '{name}' is the centre of mass of a body without joints"
         if field in ("cinert", "cfrc_ext") and any(row and not m.body_weldid[row] for row in rows):

@@ -21,7 +21,7 @@ from ...native import cache_of_user
 
 _FOLDER = pathlib.Path(__file__).parent
 _PARTS = ("smooth", "contacts", "solver", "readouts", "step")
-_SOURCES = ("kernel.cu", "boxes.h", "threads.h", *(f"threads_{part}.h" for part in _PARTS))
+_SOURCES = ("kernel.cu", "box_pair.h", "boxes.h", "threads.h", *(f"threads_{part}.h" for part in _PARTS))
 # Denormals are nothing that a simulation needs, and a root or reciprocal that heeds them takes longer.
 _OPTIONS = ("--std=c++17", "--device-as-default-execution-space", "--ftz=true")
 _WORLDS = 16  # at a time on a multiprocessor, which bounds a thread's registers: 128

@@ -2,14 +2,15 @@
 #pragma once
 #include "vector.h"
 
-enum { SLIDE = 0, HINGE = 1, SHIFT = 2 };
-enum { XPOS, XQUAT, XMAT, XIPOS, SUBTREE_COM, CINERT, CVEL, CFRC_EXT, QFRC_ACTUATOR };
+enum { SLIDE = 0, HINGE = 1, SHIFT = 2, FREE = 3 };
+enum { XPOS, XQUAT, XMAT, XIPOS, SUBTREE_COM, CINERT, CVEL, CFRC_EXT, QFRC_ACTUATOR, QACC };
 
 struct ImpedanceRow {
   Real stiffness, damping, lowest, highest, inverse_width;
 };
 struct ContactRow {
-  Real friction, margin;
+  int dims;
+  Real friction[5], margin;
   ImpedanceRow impedance;
   Real regularisation;
 };
@@ -32,7 +33,7 @@ struct BoxRow {
   Real centre[3], axes[9], size[3];
 };
 struct PointRow {
-  int body, place, capsule;
+  int body, place, capsule, corner;  // 1 to 8 of a box
   Real centre[3], axis[3], radius, height;
   ContactRow contact;
 };
@@ -56,8 +57,8 @@ struct LimitRow {
   Real inverse_weight;
 };
 struct MotorRow {
-  int dof;
-  Real gain, low, high;
+  int dof, qpos, body;  // -1: it acts at a site of the body
+  Real place[3], push[3], turn[3], gear, gain, low, high, bias[3], weakest, strongest;
 };
 struct ReadingRow {
   int field, row;

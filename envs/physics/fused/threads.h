@@ -1,8 +1,7 @@
 // MuJoCo's control step, one warp of 32 threads a world.
 //
-// The tables of a model are written by threads.py: trees of hinges and slides on a free root or on the world; spheres
-// and capsules on a floor, on boxes and on each other; pyramids, limits, springs, fluid; RK4, or Euler with implicit
-// damping.
+// The tables of a model are written by threads.py: trees of hinges, slides and free joints; spheres, capsules and boxes
+// on a floor and on each other; pyramids, limits, springs, servos, fluid; RK4, or Euler with implicit damping.
 // threads_smooth.h, _contacts.h, _solver.h, _readouts.h and _step.h are the step in this order; this file is what a
 // warp needs besides: lanes, algebra, sums.
 //

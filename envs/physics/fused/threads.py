@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .model import FIELDS, Contact, Impedance, Tables
+from .model import FIELDS, Contact, Impedance, Tables, dofs_of
 
 LANES = 32
 MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
 MOST_SEGMENTS, MOST_PAIRS = 512, 4096  # what a multiprocessor's memory has room for in each of its worlds
+MOST_BYTES = 49_152  # of memory that a block's threads share, without asking for more
 
 _LONGEST_TRUNK = 9  # its triangle is in every lane's registers
 _ROUND_COST = 60.0  # of a round of the branches, in a trunk's multiplications
@@ -43,6 +44,7 @@ def obstacle(tables: Tables) -> str | None:
     sizes = {
         "degrees of freedom": (tables.nv, LANES),
         "joints": (len(tables.joints), LANES),
+        "actuators": (tables.nu, LANES),
         "moving bodies": (len(tables.bodies), LANES),
         "joints with limits": (len(tables.limits), LANES),
         "bodies in a fluid": (len(tables.boxes), LANES),
@@ -52,7 +54,38 @@ def obstacle(tables: Tables) -> str | None:
     for what, (size, most) in sizes.items():
         if size > most:
             return f"cannot step this model: it has {size} {what}, and a warp takes {most}"
+    needed = shared_bytes(tables)
+    if needed > MOST_BYTES:
+        return f"cannot step this model: a world of it takes {needed} bytes, and a warp's memory has {MOST_BYTES}"
     return None
+
+
+def shared_bytes(t: Tables) -> int:
+    """Of what the lanes of a world share: `World` in threads_smooth.h, to some 100 bytes."""
+    trunk, more, slots = schedule(t).trunk, t.directions > 3, _slot_count(t)
+    packed = trunk * (trunk + 3) // 2 + 4
+    numbers = max(17 * (len(t.joints) + 1), 7 * t.nv, packed + 2 * t.nv + 4)
+    numbers += t.nv * (_fours(t.nv) + (t.nv + 1 | 1) + 7 + 14) + 2 * t.nq + 9 + 35 * len(t.bodies) + 14 * len(t.boxes)
+    numbers += slots * (_fours((8 if more else 4) * _most_columns(t)) + (24 if more else 12))
+    numbers += 0 if _own_slots(t) else 13 * slots + t.nv
+    numbers += 2 * t.nu + (7 * (len(t.segments) + 1) + len(t.pairs) // 2 if t.pairs else 0)
+    return 4 * numbers
+
+
+def _fours(count: int) -> int:
+    """As in threads_smooth.h."""
+    fours = -(-count // 4)
+    return 4 * (fours if fours % 2 else fours + 1)
+
+
+def _most_columns(t: Tables) -> int:
+    """Of a contact's Jacobian."""
+    return max([len(t.bodies[p.body].chain) for p in t.points] + [len(p.dofs) for p in t.pairs], default=1)
+
+
+def _slot_count(t: Tables) -> int:
+    """Contacts of a world at a time."""
+    return max(1, len(t.points) if _own_slots(t) else min(MOST_SLOTS, t.most_contacts))
 
 
 def schedule(tables: Tables) -> Schedule:
@@ -60,8 +93,6 @@ def schedule(tables: Tables) -> Schedule:
     below = tuple(sum(d in above for above in tables.ancestors) for d in range(tables.nv))
     for d, number in enumerate(below):
         assert all(d in tables.ancestors[k] for k in range(d + 1, d + 1 + number)), "dofs are not in depth-first order"
-    first = (6, 7) if tables.has_free else (0, 0)
-    assert [(j.dof, j.qpos) for j in tables.joints] == [(first[0] + k, first[1] + k) for k in range(len(tables.joints))]
     longest = 0
     while longest < min(tables.nv, _LONGEST_TRUNK) and len(tables.ancestors[longest]) == longest:
         longest += 1
@@ -153,6 +184,13 @@ class _Writer:
         self._lines.append(f"TABLE({kind}) {name.upper()}_[] = {{{', '.join(shown)}}};")
         self._lines.append(f"DEVICE {kind} {name}(int i) {{ return {name.upper()}_[i]; }}")
 
+    def addresses(self, name: str, values: Sequence[int]) -> None:
+        """A function of an item's index; a sum with it, where the addresses follow one another."""
+        if all(value == values[0] + k for k, value in enumerate(values)):
+            self._lines.append(f"DEVICE int {name}(int i) {{ return i + {values[0] if values else 0}; }}")
+        else:
+            self.scalars(name, values, "int")
+
     def vectors(self, name: str, values: Iterable[np.ndarray]) -> None:
         rows = np.array(list(values), float).reshape(-1, 3)
         for k, part in enumerate("xyz"):
@@ -185,24 +223,26 @@ def _number(value: float) -> str:
 
 
 def _sizes(out: _Writer, t: Tables) -> None:
-    own = _own_slots(t)
-    columns = [len(t.bodies[p.body].chain) for p in t.points] + [len(p.dofs) for p in t.pairs]
     out.define(
         NQ=t.nq,
         NV=t.nv,
         NU=t.nu,
         SUBSTEPS=t.substeps,
+        FORWARD=t.forward,
         RK4=t.rk4,
         FREE=t.has_free,
         BODIES=len(t.bodies),
         JOINTS=len(t.joints),
         POINTS=len(t.points),
+        CORNER_POINTS=any(p.corner for p in t.points),
         PAIRS=len(t.pairs),
-        BLOCK_PAIRS=sum(p.with_block for p in t.pairs),
+        BLOCK_PAIRS=sum(p.blocks == 1 for p in t.pairs),
+        BOX_PAIRS=sum(p.blocks == 2 for p in t.pairs),
+        DIRECTIONS=t.directions,
         SEGMENTS=len(t.segments),
-        OWN_SLOTS=own,
-        SLOTS=max(1, len(t.points) if own else min(MOST_SLOTS, t.most_contacts)),
-        COLUMNS=max(columns, default=1),
+        OWN_SLOTS=_own_slots(t),
+        SLOTS=_slot_count(t),
+        COLUMNS=_most_columns(t),
         LIMITS=len(t.limits),
         FLUID=bool(t.boxes),
         BOXES=len(t.boxes),
@@ -222,17 +262,20 @@ def _sizes(out: _Writer, t: Tables) -> None:
 
 def _tree(out: _Writer, t: Tables) -> None:
     """Joints, bodies, dofs and motors."""
-    out.line("enum { HINGE, SLIDE, SHIFT };")
+    out.line("enum { HINGE, SLIDE, SHIFT, FREE_JOINT };")
     with out.record("joint"):
         out.vectors("joint_axis", (j.axis for j in t.joints))
         out.scalars("joint_reference", (j.reference for j in t.joints))
         out.vectors("joint_anchor", (j.anchor for j in t.joints))
         out.matrices("joint_rotation", (j.rotation for j in t.joints))
         out.vectors("joint_position", (j.position for j in t.joints))
-        out.scalars("joint_kind", (0 if j.hinge else 2 if j.shift else 1 for j in t.joints), "int")
+        out.scalars("joint_kind", (0 if j.hinge else 3 if j.free else 2 if j.shift else 1 for j in t.joints), "int")
+    out.addresses("joint_dof", [j.dof for j in t.joints])
+    out.addresses("joint_qpos", [j.qpos for j in t.joints])
     out.quats("joint_quat", (j.quat for j in t.joints))
     out.define(
         ALL_HINGES=all(j.hinge for j in t.joints),
+        FREE_JOINTS=any(j.free for j in t.joints),
         TURNED_JOINTS=any((j.rotation != np.eye(3)).any() for j in t.joints),
         OFFSET_JOINTS=any(j.position.any() for j in t.joints),
     )
@@ -247,21 +290,34 @@ def _tree(out: _Writer, t: Tables) -> None:
     out.fixed("BODY_PARENT", [b.parent for b in t.bodies])
     out.fixed("BODY_CHANGES", [k in parents | dragged for k in range(len(t.bodies))])
     out.scalars("body_dofs", (_bits(b.chain) for b in t.bodies), "unsigned")
-    owner = {j.dof: j.body for j in t.joints}
+    owner = {dof: j.body for j in t.joints for dof in dofs_of(j)}
     with out.record("dof"):
         for name in ("armature", "damping", "stiffness", "spring"):
             out.scalars(f"dof_{name}", getattr(t, name))
         out.scalars("dof_body", (owner.get(d, 0) for d in range(t.nv)), "int")
-    with out.record("motor"):
-        for name in ("gain", "low", "high"):
-            out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors))
-        out.scalars("motor_dof", (m.dof for m in t.motors), "int")
+    out.addresses("dof_qpos", t.qpos_of_dof.tolist())
+    _motors(out, t)
     with out.record("box"):
         out.scalars("box_body", (b.body for b in t.boxes), "int")
         out.vectors("box_centre", (b.centre for b in t.boxes))
         out.vectors("box_size", (b.size for b in t.boxes))
         out.matrices("box_axes", (b.axes for b in t.boxes))
     out.fixed("BOX_BODY", [b.body for b in t.boxes])
+
+
+def _motors(out: _Writer, t: Tables) -> None:
+    servos = not all(m.plain for m in t.motors)
+    out.define(SERVOS=servos)
+    with out.record("motor"):
+        for name in ("gain", "low", "high", "gear"):
+            out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors))
+        if servos:
+            for name in ("weakest", "strongest"):
+                out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors))
+            for name in ("place", "push", "turn", "bias"):
+                out.vectors(f"motor_{name}", (np.array(getattr(m, name)) for m in t.motors))
+    for name in ("dof", "qpos", "body"):  # of its own table, as -1 is among them
+        out.scalars(f"motor_{name}", (getattr(m, name) for m in t.motors), "int")
 
 
 def _chains(out: _Writer, t: Tables) -> None:
@@ -378,7 +434,8 @@ def _contacts(out: _Writer, t: Tables) -> None:
         out.vectors("point_axis", (p.axis for p in t.points))
         out.scalars("point_height", (p.height for p in t.points))
         out.scalars("point_body", (p.body for p in t.points), "int")
-        out.scalars("point_round", (not p.axis.any() for p in t.points), "bool")
+        out.scalars("point_round", (p.corner or not p.axis.any() for p in t.points), "bool")
+        out.scalars("point_corner", (p.corner for p in t.points), "int")
     with out.record("segment"):
         out.vectors("segment_centre", (s.centre for s in t.segments))
         out.scalars("segment_radius", (s.radius for s in t.segments))
@@ -398,15 +455,19 @@ def _contacts(out: _Writer, t: Tables) -> None:
     dofs = [_bits(t.bodies[p.body].chain) for p in t.points] + [_bits(p.dofs) for p in t.pairs]
     minus = [_bits(d for d, sign in zip(p.dofs, p.signs, strict=True) if sign < 0) for p in t.pairs]
     with out.record("contact"):
-        for name in ("friction", "margin", "regularisation"):
+        for name in ("margin", "regularisation"):
             out.scalars(f"contact_{name}", (getattr(c, name) for c in contacts))
+        for k, name in {0: "friction", 2: "spin", 3: "roll"}.items():
+            out.scalars(f"contact_{name}", (c.friction[k] for c in contacts))
+        out.scalars("contact_dims", (c.dims for c in contacts), "int")
         for name in Impedance._fields:
             out.scalars(f"contact_{name}", (getattr(c.impedance, name) for c in contacts))
         out.scalars("contact_dofs", dofs, "unsigned")
         out.scalars("contact_opposite", [0] * len(t.points) + minus, "unsigned")
         out.scalars("contact_fills", [False] * len(t.points) + fills, "bool")
-    first = [-1] * len(t.points) + [(t.blocks if p.with_block else t.segments)[p.first].place for p in t.pairs]
-    second = [p.place for p in t.points] + [t.segments[p.second].place for p in t.pairs]
+    first = [-1] * len(t.points) + [(t.blocks if p.blocks else t.segments)[p.first].place for p in t.pairs]
+    second = [p.place for p in t.points]
+    second += [(t.blocks if p.blocks == 2 else t.segments)[p.second].place for p in t.pairs]
     out.scalars("contact_first_place", first, "int")
     out.scalars("contact_second_place", second, "int")
 
@@ -418,6 +479,7 @@ def _limits(out: _Writer, t: Tables) -> None:
         for name in Impedance._fields:
             out.scalars(f"limit_{name}", (getattr(x.impedance, name) for x in t.limits))
         out.scalars("limit_dof", (x.dof for x in t.limits), "int")
+        out.scalars("limit_qpos", (x.qpos for x in t.limits), "int")
 
 
 def _readings(out: _Writer, t: Tables) -> None:

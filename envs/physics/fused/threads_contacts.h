@@ -12,18 +12,22 @@ DEVICE bool any(bool truth) { return truth; }
 DEVICE bool differ(bool a, bool b) { return a != b; }
 DEVICE real size_of(real x) { return absolute(x); }
 DEVICE real clip(real x, real low, real high) { return clamped(x, low, high); }
+#include "box_pair.h"
 #include "boxes.h"
 
-// A lane's contact: its four edges are normal +- first, normal +- second; the tangents' Jacobians are times friction.
+// A lane's contact: its edges are the normal plus or minus each other direction, whose Jacobians are times friction.
 struct Contact {
   bool exists;
   int candidate;
-  real weight;             // D of an edge
-  real normal, first, second;     // J a - aref
-  real d_normal, d_first, d_second;  // its change along the step
-  unsigned dofs;           // those that move the two bodies apart
-  unsigned active;         // edges
+  real weight;                // D of an edge
+  real residual[DIRECTIONS];  // J a - aref
+  real change[DIRECTIONS];    // of it along the step
+  unsigned dofs;              // those that move the two bodies apart
 };
+constexpr int EDGES = 2 * (DIRECTIONS - 1);  // the most of a contact
+
+// Directions after the normal.
+DEVICE int frictions(const Contact& c) { return DIRECTIONS == 3 ? 2 : contact_dims(c.candidate) - 1; }
 
 struct Limit {
   real weight, residual, change, sign;
@@ -44,6 +48,20 @@ DEVICE real impedance_at(real violation, real lowest, real highest, real inverse
 DEVICE Vec world_up(const World& w) { return FREE ? vec_at(w.base + 6) : vec(0, 0, 1); }
 DEVICE Vec world_side(const World& w) { return FREE ? vec_at(w.base + 3) : vec(0, 1, 0); }
 
+#if CORNER_POINTS
+// Whether a corner that touches is one of the four at most that do, none of them of the upper half (mjc_PlaneBox).
+DEVICE bool is_low_corner(const World& w, int point, Vec up, const Mat& R) {
+  if (dot(up, mul(R, point_axis(point))) > 0) return false;
+  int before = 0;
+  for (int k = point - point_corner(point) + 1; k < point; ++k) {
+    const Vec place = mul(R, point_centre(k)) + vec_at(w.pose[point_body(k)] + 9);
+    const real height = dot(up, place) + (FREE ? w.qpos[2] : real(0)) - point_height(k);
+    before += height <= contact_margin(k) && dot(up, mul(R, point_axis(k))) <= 0;
+  }
+  return before < 4;
+}
+#endif
+
 // A point over the floor. mjc_PlaneSphere, mjc_PlaneCapsule: a capsule's axis is the first tangent.
 DEVICE bool touches_floor(const World& w, int point, Touch& touch) {
   const real* pose = w.pose[point_body(point)];
@@ -52,6 +70,9 @@ DEVICE bool touches_floor(const World& w, int point, Touch& touch) {
   const real height = (FREE ? w.qpos[2] : real(0)) - point_height(point);
   touch.distance = dot(up, centre) + height - point_radius(point);
   if (!(touch.distance <= contact_margin(point))) return false;
+#if CORNER_POINTS
+  if (point_corner(point) && !is_low_corner(w, point, up, R)) return false;
+#endif
   touch.normal = up;
   touch.point = centre - up * (point_radius(point) + real(0.5) * touch.distance);
   touch.tangent = point_round(point) ? world_side(w) : mul(R, point_axis(point));
@@ -149,12 +170,22 @@ DEVICE BlockFrame frame_of(const World& w, int block) {
   return {axes, vec(0, 0, 0) - mul(axes, vec_at(w.pose[body] + 9)) - offset};
 }
 
-// Pairs with blocks are the last; where all pairs or none are so, the compiler knows.
-DEVICE bool has_block(int pair) { return BLOCK_PAIRS > 0 && (BLOCK_PAIRS == PAIRS || pair >= PAIRS - BLOCK_PAIRS); }
+// Pairs of a block and a segment follow those of segments; where all pairs or none are so, the compiler knows. Those of
+// two boxes are the last.
+constexpr int ONE_BY_ONE = PAIRS - BOX_PAIRS;
+DEVICE bool has_block(int pair) { return BLOCK_PAIRS > 0 && (BLOCK_PAIRS == PAIRS || pair >= ONE_BY_ONE - BLOCK_PAIRS); }
+
+DEVICE Vec middle_of(const BlockFrame& in) { return vec(0, 0, 0) - mul_transposed(in.axes, in.shift); }
 
 // Whether two bounding spheres touch, or one and a block.
 DEVICE bool is_near(const World& w, int pair) {
   const unsigned parts = pair_segments(pair);
+#if BOX_PAIRS > 0
+  if (pair >= ONE_BY_ONE) {
+    const Vec apart = middle_of(frame_of(w, parts & 65535)) - middle_of(frame_of(w, parts >> 16));
+    return dot(apart, apart) <= pair_far(pair);
+  }
+#endif
   const Vec middle = vec_at(w.segment[parts >> 16]);
   if (!has_block(pair)) {
     const Vec between = vec_at(w.segment[parts & 65535]) - middle;
@@ -167,13 +198,13 @@ DEVICE bool is_near(const World& w, int pair) {
   return square_outside(place, size) <= pair_far(pair);
 }
 
-// Lists the pairs that may touch, and returns how many.
-DEVICE int list_near(World& w) {
+// Lists the pairs from `first` to before `last` that may touch, and returns how many.
+DEVICE int list_near(World& w, int first, int last) {
   int found = 0;
-  ROLLED for (int start = 0; start < PAIRS; start += LANES) {
+  ROLLED for (int start = first; start < last; start += LANES) {
     PerLane<bool> near;
     EACH_LANE {
-      near[ME] = start + lane < PAIRS && is_near(w, start + lane);
+      near[ME] = start + lane < last && is_near(w, start + lane);
     }
     const unsigned hits = ballot(near);
     EACH_LANE if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
@@ -181,6 +212,12 @@ DEVICE int list_near(World& w) {
   }
   MEET();
   return found;
+}
+
+// What the first tangent on a normal follows (mju_makeFrame).
+DEVICE Vec tangent_wanted(const World& w, Vec normal) {
+  const Vec side = world_side(w);
+  return absolute(dot(side, normal)) < real(0.5) ? side : world_up(w);
 }
 
 // mjraw_SphereSphere at the nearest places. Segments that cross have no normal: MuJoCo takes a product of two axes.
@@ -200,11 +237,10 @@ DEVICE bool touches_pair(const World& w, int pair, int which, Touch& touch) {
     const real size = root(dot(normal, normal));
     normal = size < real(1e-15) ? vec(1, 0, 0) : normal * (real(1) / size);
   }
-  const Vec side = world_side(w);
   touch.distance = length - radii;
   touch.normal = normal;
   touch.point = found.from + normal * (segment_radius(first) + real(0.5) * touch.distance);
-  touch.tangent = absolute(dot(side, normal)) < real(0.5) ? side : world_up(w);
+  touch.tangent = tangent_wanted(w, normal);
   return true;
 }
 
@@ -231,8 +267,7 @@ DEVICE bool touches_block(const World& w, int pair, int which, Touch& touch) {
   if (!(touch.distance <= contact_margin(POINTS + pair))) return false;
   touch.normal = mul_transposed(in.axes, vec_at(out));
   touch.point = middle + half * share - touch.normal * (segment_radius(segment) + real(0.5) * touch.distance);
-  const Vec side = world_side(w);
-  touch.tangent = absolute(dot(side, touch.normal)) < real(0.5) ? side : world_up(w);
+  touch.tangent = tangent_wanted(w, touch.normal);
   return true;
 }
 #endif
@@ -267,6 +302,57 @@ DEVICE int take(World& w, const PerLane<bool>& hit, const PerLane<int>& candidat
   return found + count(hits);
 }
 
+#if BOX_PAIRS > 0
+// A lane two boxes.
+DEVICE void touch_boxes(const World& w, int pair, Touches& found, BlockFrame& in) {
+  const unsigned parts = pair_segments(pair);
+  const int one = parts & 65535, two = parts >> 16;
+  in = frame_of(w, one);
+  const BlockFrame other = frame_of(w, two);
+  BoxPair boxes;
+  const Vec rows1[3] = {in.axes.x, in.axes.y, in.axes.z}, rows2[3] = {other.axes.x, other.axes.y, other.axes.z};
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) boxes.turn[i][j] = dot(rows1[i], rows2[j]);
+  }
+  put(boxes.apart, mul(in.axes, middle_of(other)) + in.shift);
+  put(boxes.size1, block_size(one));
+  put(boxes.size2, block_size(two));
+  boxes.margin = contact_margin(POINTS + pair);
+  touch_boxes(boxes, found);
+}
+
+// Puts the contacts of two boxes into the next free slots. Returns how many there are then.
+DEVICE int collect_boxes(World& w, PerLane<Touch>& touch, int found) {
+  const int near = list_near(w, ONE_BY_ONE, PAIRS);
+  ROLLED for (int start = 0; start < near; start += LANES) {
+    PerLane<Touches> touches;
+    PerLane<BlockFrame> in;
+    PerLane<int> candidate;
+    EACH_LANE {
+      touches[ME].count = 0;
+      candidate[ME] = POINTS + (start + lane < near ? w.near[start + lane] : 0);
+      if (start + lane < near) touch_boxes(w, candidate[ME] - POINTS, touches[ME], in[ME]);
+    }
+    ROLLED for (int k = 0; k < MOST_TOUCHES; ++k) {
+      PerLane<bool> hit;
+      EACH_LANE {
+        const Touches& all = touches[ME];
+        hit[ME] = k < all.count;
+        if (hit[ME]) {
+          Touch& one = touch[ME];
+          one.normal = mul_transposed(in[ME].axes, vec_at(all.normal));
+          one.point = mul_transposed(in[ME].axes, vec_at(all.place[k]) - in[ME].shift);
+          one.distance = all.distance[k];
+          one.tangent = tangent_wanted(w, one.normal);
+        }
+      }
+      if (any(hit)) found = take(w, hit, candidate, touch, found);
+    }
+  }
+  return found;
+}
+#endif
+
 // Contacts in slots, a lane's each: points, then pairs. Returns how many there are, those without a slot among them.
 DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>& touch) {
   PerLane<bool> hit;
@@ -281,7 +367,7 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
   }
 #if PAIRS > 0
   place_segments(w);
-  const int near = list_near(w);  // parallel capsules touch twice
+  const int near = list_near(w, 0, ONE_BY_ONE);  // parallel capsules touch twice
   ROLLED for (int start = 0; start < 2 * near; start += LANES) {
     EACH_LANE {
       const int item = start + lane, pair = item < 2 * near ? w.near[item >> 1] : 0;
@@ -291,6 +377,10 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
     }
     found = take(w, hit, candidate, touch, found);
   }
+#endif
+#if BOX_PAIRS > 0
+  MEET();
+  found = collect_boxes(w, touch, found);
 #endif
   MEET();
   EACH_LANE {
@@ -305,17 +395,19 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
 }
 #endif
 
-// A column of a contact's Jacobian: how fast a dof moves the bodies apart along the normal and the scaled tangents.
+// A contact's directions: forces, and their moments about the base's origin; of spin and rolling, moments alone.
 struct Directions {
-  Vec normal, first, second;              // forces
-  Vec normal_turn, first_turn, second_turn;  // their moments about the base's origin
+  Vec force[3], moment[DIRECTIONS];
 };
 
-DEVICE void put_column(World& w, int slot, int column, const real (&row)[3], real rate, Contact& contact) {
-  put_four(w.J + slot * J_WIDTH + 4 * column, row[0], row[1], row[2]);
-  contact.normal += row[0] * rate;
-  contact.first += row[1] * rate;
-  contact.second += row[2] * rate;
+// A column of a contact's Jacobian: how fast a dof moves the bodies apart along each direction.
+DEVICE void put_column(World& w, int slot, int column, const real (&row)[DIRECTIONS], real rate, Contact& contact) {
+  real* to = w.J + slot * J_WIDTH + COLUMN * column;
+  put_four(to, row[0], row[1], row[2]);
+#if DIRECTIONS > 3
+  put_four(to + 4, row[3], row[4], row[5]);
+#endif
+  UNROLLED for (int k = 0; k < DIRECTIONS; ++k) contact.residual[k] += row[k] * rate;
 }
 
 // The columns of the dofs that move the contact, in their order.
@@ -323,12 +415,12 @@ DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, C
   int column = 0;
 #if FREE
   if (contact.dofs & 1u) {
-    const Vec n[2] = {d.normal, d.normal_turn}, t[2] = {d.first, d.first_turn}, u[2] = {d.second, d.second_turn};
     UNROLLED for (int k = 0; k < 6; ++k) {
-      const Vec a = n[k / 3], b = t[k / 3], c = u[k / 3];
-      const int axis = k % 3;
-      const real row[3] = {axis == 0 ? a.x : axis == 1 ? a.y : a.z, axis == 0 ? b.x : axis == 1 ? b.y : b.z,
-                           axis == 0 ? c.x : axis == 1 ? c.y : c.z};
+      real row[DIRECTIONS];
+      UNROLLED for (int x = 0; x < DIRECTIONS; ++x) {
+        const Vec part = k >= 3 ? d.moment[x] : x < 3 ? d.force[x] : vec(0, 0, 0);
+        row[x] = k % 3 == 0 ? part.x : k % 3 == 1 ? part.y : part.z;
+      }
       put_column(w, slot, k, row, w.acceleration[k] + damping * w.velocity[k], contact);
     }
     column = 6;
@@ -340,12 +432,14 @@ DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, C
   for (unsigned dofs = contact.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) {
     const int dof = lowest(dofs);
     const Vec angular = vec_at(w.axis[dof]), linear = vec_at(w.axis[dof] + 3);
-    real row[3] = {dot(angular, d.normal_turn) + dot(linear, d.normal),
-                   dot(angular, d.first_turn) + dot(linear, d.first),
-                   dot(angular, d.second_turn) + dot(linear, d.second)};
+    real row[DIRECTIONS];
+    UNROLLED for (int x = 0; x < DIRECTIONS; ++x) {
+      row[x] = dot(angular, d.moment[x]);
+      if (x < 3) row[x] += dot(linear, d.force[x]);
+    }
 #if PAIRS > 0
     if (opposite >> dof & 1u) {
-      UNROLLED for (int k = 0; k < 3; ++k) row[k] = -row[k];
+      UNROLLED for (int x = 0; x < DIRECTIONS; ++x) row[x] = -row[x];
     }
 #endif
     put_column(w, slot, column++, row, w.acceleration[dof] + damping * w.velocity[dof], contact);
@@ -361,26 +455,33 @@ DEVICE int column_of(const World& w, int slot, int dof) {
 #endif
 }
 
-// The first tangent times friction (mju_makeFrame).
-DEVICE Vec first_tangent(const Touch& touch, int candidate) {
+// The first tangent (mju_makeFrame).
+DEVICE Vec first_tangent(const Touch& touch) {
   const Vec t = touch.tangent - touch.normal * dot(touch.normal, touch.tangent);
-  return t * (contact_friction(candidate) * inverse_root(dot(t, t) + real(1e-30)));
+  return t * inverse_root(dot(t, t) + real(1e-30));
 }
 
 // A lane's contact: its Jacobian, its weight (mj_makeImpedance) and its residual J a - aref at the solver's start.
 DEVICE void start_contact(World& w, int slot, const Touch& touch, Contact& contact) {
-  contact.weight = contact.normal = contact.first = contact.second = 0;
-  contact.d_normal = contact.d_first = contact.d_second = 0;
+  contact.weight = 0;
+  UNROLLED for (int k = 0; k < DIRECTIONS; ++k) contact.residual[k] = contact.change[k] = 0;
   contact.dofs = 0;
   if (!contact.exists) return;
   const int c = contact.candidate;
-  const Vec n = touch.normal, r = touch.point, first = first_tangent(touch, c), second = cross(n, first);
+  const Vec n = touch.normal, r = touch.point, t = first_tangent(touch);
+  const Vec first = t * contact_friction(c), second = cross(n, first);
   contact.dofs = contact_dofs(c);
-  put_columns(w, slot, {n, first, second, cross(r, n), cross(r, first), cross(r, second)}, contact_damping(c), contact);
+  Directions d = {{n, first, second}, {cross(r, n), cross(r, first), cross(r, second)}};
+#if DIRECTIONS > 3
+  d.moment[3] = n * contact_spin(c);
+  d.moment[4] = t * contact_roll(c);
+  d.moment[5] = cross(n, t) * contact_roll(c);
+#endif
+  put_columns(w, slot, d, contact_damping(c), contact);
   const real violation = touch.distance - contact_margin(c);
   const real impedance = impedance_at(violation, contact_lowest(c), contact_highest(c), contact_inverse_width(c));
   contact.weight = impedance * reciprocal(contact_regularisation(c) * (real(1) - impedance));
-  contact.normal += contact_stiffness(c) * impedance * violation;
+  contact.residual[0] += contact_stiffness(c) * impedance * violation;
 #if !OWN_SLOTS
   w.moved[slot] = contact.dofs;
 #endif
@@ -392,7 +493,7 @@ DEVICE void start_limit(const World& w, int lane, Limit& limit) {
 #if LIMITS > 0
   if (lane >= LIMITS) return;
   const int dof = limit_dof(lane);
-  const real q = w.qpos[dof - BASE_DOFS + BASE_QPOS], low = q - limit_low(lane), high = limit_high(lane) - q;
+  const real q = w.qpos[limit_qpos(lane)], low = q - limit_low(lane), high = limit_high(lane) - q;
   const real violation = (low < high ? low : high) - limit_margin(lane);
   if (!(violation < 0)) return;
   const real impedance = impedance_at(violation, limit_lowest(lane), limit_highest(lane), limit_inverse_width(lane));

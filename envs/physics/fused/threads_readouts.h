@@ -19,7 +19,7 @@ DEVICE Vec world_point(const World& w, int body, Vec local) {
   Vec shift = {0, 0, 0};
   if (body > 0) {
     ROLLED for (int j = 0; j < JOINTS; ++j) {
-      if (joint_kind(j) == SHIFT) shift = shift + joint_axis(j) * (w.qpos[BASE_QPOS + j] - joint_reference(j));
+      if (joint_kind(j) == SHIFT) shift = shift + joint_axis(j) * (w.qpos[joint_qpos(j)] - joint_reference(j));
     }
   }
   return inside + shift;
@@ -56,9 +56,12 @@ DEVICE Quat world_quat(const World& w, int body, Quat own) {
     ROLLED for (int level = 0; level < DEPTH; ++level) {
       const int joint = chain_link(level * BODIES + body) >> 1;
       if (joint < 0) continue;
+#if FREE_JOINTS
+      if (joint_kind(joint) == FREE_JOINT) q = {w.qpos[joint_qpos(joint) + 3], vec_at(w.qpos + joint_qpos(joint) + 4)};
+#endif
       if (joint_kind(joint) == HINGE) {
         real s, c;
-        sine_cosine(real(0.5) * (w.qpos[BASE_QPOS + joint] - joint_reference(joint)), &s, &c);
+        sine_cosine(real(0.5) * (w.qpos[joint_qpos(joint)] - joint_reference(joint)), &s, &c);
         q = product(q, {c, joint_axis(joint) * s});
       }
       q = product(q, {joint_quat_w(joint), joint_quat_v(joint)});
@@ -107,9 +110,14 @@ DEVICE void put_velocity(const World& w, int row, real* to) {
 
 // A lane's contact: its moment about the base's origin and its force, on the second body, in the world's axes.
 DEVICE void put_wrench(World& w, int slot, const Contact& c) {
-  const real edge[4] = {c.normal + c.first, c.normal - c.first, c.normal + c.second, c.normal - c.second};
-  real f[4];
-  UNROLLED for (int k = 0; k < 4; ++k) f[k] = edge[k] < 0 ? -c.weight * edge[k] : real(0);
+  real f[DIRECTIONS] = {0};
+  UNROLLED for (int k = 1; k < DIRECTIONS; ++k) {
+    if (k > frictions(c)) break;
+    const real up = c.residual[0] + c.residual[k], down = c.residual[0] - c.residual[k];
+    const real first = up < 0 ? -c.weight * up : real(0), second = down < 0 ? -c.weight * down : real(0);
+    f[0] += first + second;
+    f[k] = first - second;
+  }
   Touch touch;
 #if OWN_SLOTS
   touches_floor(w, slot, touch);
@@ -117,9 +125,15 @@ DEVICE void put_wrench(World& w, int slot, const Contact& c) {
   const real* from = w.contact[slot];
   touch = {vec_at(from), vec_at(from + 3), vec_at(from + 6), from[9]};
 #endif
-  const Vec normal = touch.normal, first = first_tangent(touch, c.candidate);
-  const Vec force = normal * (f[0] + f[1] + f[2] + f[3]) + first * (f[0] - f[1]) + cross(normal, first) * (f[2] - f[3]);
-  put(w.J + slot * J_WIDTH, cross(touch.point, force));
+  const Vec n = touch.normal, t = first_tangent(touch), u = cross(n, t);
+  const real mu = contact_friction(c.candidate);
+  const Vec force = n * f[0] + t * (mu * f[1]) + u * (mu * f[2]);
+  Vec moment = cross(touch.point, force);
+#if DIRECTIONS > 3
+  const real roll = contact_roll(c.candidate);
+  moment = moment + n * (contact_spin(c.candidate) * f[3]) + t * (roll * f[4]) + u * (roll * f[5]);
+#endif
+  put(w.J + slot * J_WIDTH, moment);
   put(w.J + slot * J_WIDTH + 3, force);
 }
 
@@ -146,6 +160,8 @@ template <int FIELD>
 DEVICE void put_row(const World& w, int row, unsigned existing, real* to) {
   if constexpr (FIELD == QFRC_ACTUATOR) {
     to[0] = w.actuator[row];
+  } else if constexpr (FIELD == QACC) {
+    to[0] = w.qacc[row];
   } else if constexpr (FIELD == CFRC_EXT) {
     put_contact_force(w, row, existing, to);
   } else if constexpr (FIELD == CINERT) {

@@ -9,15 +9,16 @@ constexpr int fours(int n) { return (n + 3) / 4 % 2 ? (n + 3) / 4 * 4 : (n + 3) 
 constexpr int WIDTH = (NV + 1) | 1;  // of a row of H: its last column is the right side
 constexpr int M_WIDTH = fours(NV);
 constexpr int PACKED = TRUNK * (TRUNK + 1) / 2 + TRUNK;  // the trunk's lower triangle, then its right side
-constexpr int J_WIDTH = fours(4 * COLUMNS);  // of a contact's Jacobian: normal, two tangents and a gap for each column
-constexpr int D_WIDTH = 12;
+constexpr int MORE = DIRECTIONS > 3;  // of contacts: spin and rolling
+constexpr int COLUMN = 4 + 4 * MORE;  // of a contact's Jacobian: normal, two tangents, a gap; spin, rolling, a gap
+constexpr int J_WIDTH = fours(COLUMN * COLUMNS);
+constexpr int D_WIDTH = 12 + 12 * MORE;
 constexpr int MOTION = 7;  // an angular and a linear part
 constexpr int FRAME = 13;
 constexpr int LINK = 17;   // a joint: rotation, anchor, axis, speed
 constexpr int SUMS = 15;   // of what hangs on a body: first moment, inertia, force, moment
 constexpr int MOST_UNROLLED = 3;  // turns of a loop: more code than a multiprocessor keeps is slower than a loop
-constexpr int BASE_DOFS = FREE ? 6 : 0;   // joint j moves dof BASE_DOFS + j,
-constexpr int BASE_QPOS = FREE ? 7 : 0;   // and its qpos is BASE_QPOS + j
+constexpr int BASE_DOFS = FREE ? 6 : 0;   // of the root
 
 // What the lanes of a world share.
 struct alignas(16) World {
@@ -33,13 +34,21 @@ struct alignas(16) World {
   alignas(16) real acceleration[(NV + 3) / 4 * 4];  // the solver's qacc, in the base's frame
   alignas(16) real M[NV * M_WIDTH];
   alignas(16) real J[SLOTS * J_WIDTH];
-  alignas(16) real D[SLOTS * D_WIDTH];  // a contact's weights nn n1 n2 11 22 and, from the ninth, its force n 1 2
+  // A contact's weights nn n1 n2 11 22 and, from the ninth, its force n 1 2; then of spin and rolling n3 n4 n5 33 44 55
+  // and, from the twenty-first, their moments.
+  alignas(16) real D[SLOTS * D_WIDTH];
   real H[NV * WIDTH];                   // above its diagonal it holds the factor L, transposed
   real qacc[NV];                        // in MuJoCo's coordinates; the start of the next solve
   real qpos[NQ], qvel[NV], actuator[NV];
   real start_qpos[NQ], start_qvel[NV], sum_velocity[NV], sum_acceleration[NV], rate[NV];
   real velocity[NV];  // qvel in the base's frame
   real smooth[NV];    // forces without constraints
+#if SERVOS
+  real drive[NU], motor[NU];  // forces of actuators by their controls, and of all
+#endif
+#if FORWARD
+  real warmstart[NV];
+#endif
   real limit_weight[NV], limit_force[NV];
   real base[9];
   real pose[BODIES][FRAME];
@@ -50,7 +59,7 @@ struct alignas(16) World {
   real drag[BOXES][7];
 #endif
 #if PAIRS > 0
-  real segment[SEGMENTS][7];  // middle, and half of the length
+  real segment[SEGMENTS + 1][7];  // middle, and half of the length
   short near[PAIRS];          // pairs that may touch
 #endif
 #if !OWN_SLOTS
@@ -92,19 +101,28 @@ DEVICE void place_joints(World& w) {
       w.acceleration[lane] = w.qacc[lane];
     }
     if (lane < JOINTS) {
-      const real at = w.qpos[BASE_QPOS + lane] - joint_reference(lane);
+      const int address = joint_qpos(lane);
+      const real at = w.qpos[address] - joint_reference(lane);
       const Vec axis = joint_axis(lane);
       const int kind = joint_kind(lane);
       Vec anchor = joint_anchor(lane);
       Mat R = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
       if (kind == HINGE) R = rotation(axis, at);
       if (kind == SLIDE) anchor = anchor + axis * at;
+#if FREE_JOINTS
+      if (kind == FREE_JOINT) {
+        const real* q = w.qpos + address + 3;
+        const real scale = inverse_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        R = rotation(q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale);
+        anchor = vec_at(w.qpos + address);
+      }
+#endif
       if constexpr (TURNED_JOINTS) R = mul(R, joint_rotation(lane));
       real* to = w.joint[lane];
       put(to, R);
       put(to + 9, anchor);
       put(to + 12, axis);
-      to[15] = w.qvel[BASE_DOFS + lane];
+      to[15] = w.qvel[joint_dof(lane)];
     }
   }
   MEET();
@@ -121,10 +139,33 @@ struct Walk {
   }
 };
 
+#if FREE_JOINTS
+// A free joint: its place and attitude are its own, and it has no parent but the world.
+DEVICE void pass_free_joint(World& w, Walk& walk, int joint, bool own) {
+  const int dof = joint_dof(joint);
+  walk.R = mat_at(w.joint[joint]);
+  walk.p = vec_at(w.joint[joint] + 9);
+  walk.spin = mul(walk.R, vec_at(w.qvel + dof + 3));
+  walk.velocity = vec_at(w.qvel + dof);
+  if (!own) return;
+  const Mat columns = transposed(walk.R);
+  for (int k = 0; k < 3; ++k) {
+    const Vec axis = k == 0 ? columns.x : k == 1 ? columns.y : columns.z;
+    put(w.axis[dof + k], vec(0, 0, 0));
+    put(w.axis[dof + k] + 3, vec(k == 0, k == 1, k == 2));
+    put(w.axis[dof + 3 + k], axis);
+    put(w.axis[dof + 3 + k] + 3, cross(walk.p, axis));
+  }
+}
+#endif
+
 DEVICE void pass_joint(World& w, Walk& walk, int joint, bool own) {
+#if FREE_JOINTS
+  if (joint_kind(joint) == FREE_JOINT) return pass_free_joint(w, walk, joint, own);
+#endif
   const real* at = w.joint[joint];
   const real speed = at[15];
-  real* to = w.axis[BASE_DOFS + joint];
+  real* to = w.axis[joint_dof(joint)];
   walk.move(mul(walk.R, vec_at(at + 9)));
   const Vec axis = mul(walk.R, vec_at(at + 12));
   if (ALL_HINGES || joint_kind(joint) == HINGE) {
@@ -250,7 +291,7 @@ DEVICE void find_forces(World& w) {
   EACH_LANE if (lane < NV) {
     real force = w.actuator[lane] - dof_damping(lane) * w.velocity[lane];
     if (SPRINGS && lane >= BASE_DOFS) {
-      force -= dof_stiffness(lane) * (w.qpos[lane - BASE_DOFS + BASE_QPOS] - dof_spring(lane));
+      force -= dof_stiffness(lane) * (w.qpos[dof_qpos(lane)] - dof_spring(lane));
     }
     if (FREE && lane < 6) {
       w.smooth[lane] = force - w.sums[0][9 + lane];
@@ -315,11 +356,52 @@ DEVICE void clear(World& w) {
 #endif
 }
 
-// Of all motors on a dof, at controls clipped to their ranges.
-DEVICE real motor_force(const real* ctrl, int dof) {
-  real force = 0;
-  ROLLED for (int m = 0; m < NU; ++m) {
-    if (motor_dof(m) == dof) force += motor_gain(m) * clamped(ctrl[m], motor_low(m), motor_high(m));
+// What motors do by their controls, clipped to their ranges.
+DEVICE real motor_drive(const real* ctrl, int m) {
+  return motor_gain(m) * clamped(ctrl[m], motor_low(m), motor_high(m));
+}
+
+#if SERVOS
+// What a unit of a motor's force does along a dof.
+DEVICE real motor_share(const World& w, int m, int dof) {
+  if (motor_dof(m) >= 0) return motor_dof(m) == dof ? motor_gear(m) : real(0);
+  const int body = motor_body(m);
+  if (!(body_dofs(body) >> dof & 1u)) return 0;
+  const Mat R = mat_at(w.pose[body]);
+  const Vec push = mul(R, motor_push(m)), arm = mul(R, motor_place(m)) + vec_at(w.pose[body] + 9);
+  const Vec turn = cross(arm, push) + mul(R, motor_turn(m));
+  return dot(vec_at(w.axis[dof]), turn) + dot(vec_at(w.axis[dof] + 3), push);
+}
+
+// The forces of motors, which depend on places and speeds (mj_fwdActuation): a lane a motor, then a lane a dof.
+DEVICE void find_drives(World& w) {
+  EACH_LANE if (lane < NU) {
+    real speed = 0;
+    ROLLED for (int dof = 0; dof < NV; ++dof) speed += motor_share(w, lane, dof) * w.velocity[dof];
+    const real place = motor_dof(lane) >= 0 ? motor_gear(lane) * w.qpos[motor_qpos(lane)] : real(0);
+    const real force = w.drive[lane] + motor_bias_x(lane) + motor_bias_y(lane) * place + motor_bias_z(lane) * speed;
+    w.motor[lane] = clamped(force, motor_weakest(lane), motor_strongest(lane));
   }
-  return force;
+  MEET();
+  EACH_LANE if (lane < NV) {
+    real force = 0;
+    ROLLED for (int m = 0; m < NU; ++m) force += motor_share(w, m, lane) * w.motor[m];
+    w.actuator[lane] = force;
+  }
+  MEET();
+}
+#endif
+
+DEVICE void load_controls(World& w, const real* ctrl) {
+#if SERVOS
+  EACH_LANE if (lane < NU) w.drive[lane] = motor_drive(ctrl, lane);
+#else
+  EACH_LANE if (lane < NV) {
+    real force = 0;
+    ROLLED for (int m = 0; m < NU; ++m) {
+      if (motor_dof(m) == lane) force += motor_gear(m) * motor_drive(ctrl, m);
+    }
+    w.actuator[lane] = force;
+  }
+#endif
 }

@@ -165,27 +165,48 @@ DEVICE void solve_full(World& w, PerLane<real>& x) {
 }
 #endif
 
+// The edges whose residual is negative, a bit each.
+DEVICE unsigned pushing_edges(const real (&residual)[DIRECTIONS], int frictions) {
+  unsigned bits = 0;
+  UNROLLED for (int k = 1; k < DIRECTIONS; ++k) {
+    if (k > frictions) break;
+    bits |= unsigned(residual[0] + residual[k] < 0) << (2 * k - 2) | unsigned(residual[0] - residual[k] < 0) << (2 * k - 1);
+  }
+  return bits;
+}
+
+// Weights and forces of the edges that push, between the contact's directions; see World.
+DEVICE void put_weights(real* to, const Contact& c, unsigned bits) {
+  real whole = 0, force[DIRECTIONS] = {0}, mixed[DIRECTIONS] = {0}, own[DIRECTIONS] = {0};
+  UNROLLED for (int k = 1; k < DIRECTIONS; ++k) {
+    const real first = bits >> (2 * k - 2) & 1u ? c.weight : real(0);
+    const real second = bits >> (2 * k - 1) & 1u ? c.weight : real(0);
+    const real up = -first * (c.residual[0] + c.residual[k]), down = -second * (c.residual[0] - c.residual[k]);
+    whole += first + second;
+    mixed[k] = first - second;
+    own[k] = first + second;
+    force[0] += up + down;
+    force[k] = up - down;
+  }
+  put_four(to, whole, mixed[1], mixed[2]);
+  put_four(to + 4, own[1], own[2], 0);
+  put_four(to + 8, force[0], force[1], force[2]);
+#if DIRECTIONS > 3
+  put_four(to + 12, mixed[3], mixed[4], mixed[5]);
+  put_four(to + 16, own[3], own[4], own[5]);
+  put_four(to + 20, force[3], force[4], force[5]);
+#endif
+}
+
 // Which edges and limits push; their weights and forces for the lanes that sum them. Returns the contacts that push.
 DEVICE unsigned find_active(World& w, PerLane<Contact>& contacts, PerLane<Limit>& limits, PerLane<unsigned>& active) {
   PerLane<bool> pushes;
   EACH_LANE {
     const Contact& c = contacts[ME];
-    const real edge[4] = {c.normal + c.first, c.normal - c.first, c.normal + c.second, c.normal - c.second};
     unsigned bits = 0;
     if (c.exists) {
-      real d[4], f[4];
-      UNROLLED for (int k = 0; k < 4; ++k) {
-        const bool on = edge[k] < 0;
-        bits |= unsigned(on) << k;
-        d[k] = on ? c.weight : real(0);
-        f[k] = -d[k] * edge[k];
-      }
-      if (bits) {
-        real* to = w.D + lane * D_WIDTH;
-        put_four(to, d[0] + d[1] + d[2] + d[3], d[0] - d[1], d[2] - d[3]);
-        put_four(to + 4, d[0] + d[1], d[2] + d[3], 0);
-        put_four(to + 8, f[0] + f[1] + f[2] + f[3], f[0] - f[1], f[2] - f[3]);
-      }
+      bits = pushing_edges(c.residual, frictions(c));
+      if (bits) put_weights(w.D + lane * D_WIDTH, c, bits);
     }
     pushes[ME] = bits != 0;
 #if LIMITS > 0
@@ -193,7 +214,7 @@ DEVICE unsigned find_active(World& w, PerLane<Contact>& contacts, PerLane<Limit>
       const Limit& l = limits[ME];
       const bool on = l.residual < 0;
       const int dof = limit_dof(lane);
-      bits |= unsigned(on) << 4;
+      bits |= unsigned(on) << EDGES;
       w.limit_weight[dof] = on ? l.weight : real(0);
       w.limit_force[dof] = on ? -l.weight * l.residual * l.sign : real(0);
     }
@@ -228,10 +249,16 @@ DEVICE real contact_entry(const World& w, int i, int j, int column_i, int column
   for (; slots; slots &= slots - 1) {
     const int slot = lowest(slots);
     const real* J = w.J + slot * J_WIDTH;
-    const Four a = four_at(J + 4 * (OWN_SLOTS ? column_i : column_of(w, slot, i)));
-    const Four b = four_at(J + 4 * (OWN_SLOTS ? column_j : column_of(w, slot, j)));
-    const Four n = four_at(w.D + slot * D_WIDTH), t = four_at(w.D + slot * D_WIDTH + 4);
+    const real* A = J + COLUMN * (OWN_SLOTS ? column_i : column_of(w, slot, i));
+    const real* B = J + COLUMN * (OWN_SLOTS ? column_j : column_of(w, slot, j));
+    const real* D = w.D + slot * D_WIDTH;
+    const Four a = four_at(A), b = four_at(B), n = four_at(D), t = four_at(D + 4);
     y += a.x * (n.x * b.x + n.y * b.y + n.z * b.z) + a.y * (n.y * b.x + t.x * b.y) + a.z * (n.z * b.x + t.y * b.z);
+#if DIRECTIONS > 3
+    const Four c = four_at(A + 4), d = four_at(B + 4), m = four_at(D + 12), o = four_at(D + 16);
+    y += a.x * (m.x * d.x + m.y * d.y + m.z * d.z) + c.x * (m.x * b.x + o.x * d.x) + c.y * (m.y * b.x + o.y * d.y) +
+         c.z * (m.z * b.x + o.z * d.z);
+#endif
   }
   return y;
 }
@@ -244,9 +271,13 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
       real y = excess[ME] - w.limit_force[lane];
       for (unsigned slots = pushing & touching(w, lane); slots; slots &= slots - 1) {
         const int slot = lowest(slots);
-        const Four J = four_at(w.J + slot * J_WIDTH + 4 * column_of(w, slot, lane));
-        const Four f = four_at(w.D + slot * D_WIDTH + 8);
+        const real* column = w.J + slot * J_WIDTH + COLUMN * column_of(w, slot, lane);
+        const Four J = four_at(column), f = four_at(w.D + slot * D_WIDTH + 8);
         y -= J.x * f.x + J.y * f.y + J.z * f.z;
+#if DIRECTIONS > 3
+        const Four K = four_at(column + 4), g = four_at(w.D + slot * D_WIDTH + 20);
+        y -= K.x * g.x + K.y * g.y + K.z * g.z;
+#endif
       }
       gradient[ME] = y;
       w.H[lane * WIDTH + NV] = y;
@@ -283,15 +314,21 @@ DEVICE bool find_changes(World& w, PerLane<Contact>& contacts, PerLane<Limit>& l
     Contact& c = contacts[ME];
     unsigned bits = 0;
     if (c.exists) {
-      real n = 0, t = 0, u = 0;
+      real after[DIRECTIONS] = {0};
       const real* J = w.J + lane * J_WIDTH;
       const auto add = [&](int dof) {
         const Four column = four_at(J);
         const real step = w.step[dof];
-        n += column.x * step;
-        t += column.y * step;
-        u += column.z * step;
-        J += 4;
+        after[0] += column.x * step;
+        after[1] += column.y * step;
+        after[2] += column.z * step;
+#if DIRECTIONS > 3
+        const Four more = four_at(J + 4);
+        after[3] += more.x * step;
+        after[4] += more.y * step;
+        after[5] += more.z * step;
+#endif
+        J += COLUMN;
       };
 #if FREE
       if (c.dofs & 1u) {
@@ -299,19 +336,17 @@ DEVICE bool find_changes(World& w, PerLane<Contact>& contacts, PerLane<Limit>& l
       }
 #endif
       for (unsigned dofs = c.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) add(lowest(dofs));
-      c.d_normal = n;
-      c.d_first = t;
-      c.d_second = u;
-      n += c.normal;
-      t += c.first;
-      u += c.second;
-      bits = unsigned(n + t < 0) | unsigned(n - t < 0) << 1 | unsigned(n + u < 0) << 2 | unsigned(n - u < 0) << 3;
+      UNROLLED for (int k = 0; k < DIRECTIONS; ++k) {
+        c.change[k] = after[k];
+        after[k] += c.residual[k];
+      }
+      bits = pushing_edges(after, frictions(c));
     }
 #if LIMITS > 0
     if (lane < LIMITS) {
       Limit& l = limits[ME];
       l.change = l.sign * w.step[limit_dof(lane)];
-      bits |= unsigned(l.residual + l.change < 0) << 4;
+      bits |= unsigned(l.residual + l.change < 0) << EDGES;
     }
 #endif
     differs[ME] = bits != active[ME];
@@ -336,12 +371,13 @@ DEVICE real search_line(const PerLane<Contact>& contacts, const PerLane<Limit>& 
     EACH_LANE {
       real a = 0, b = 0;
       const Contact& c = contacts[ME];
-      const real n = c.normal + length * c.d_normal, t = c.first + length * c.d_first;
-      const real u = c.second + length * c.d_second;
-      add_row(n + t, c.d_normal + c.d_first, c.weight, a, b);
-      add_row(n - t, c.d_normal - c.d_first, c.weight, a, b);
-      add_row(n + u, c.d_normal + c.d_second, c.weight, a, b);
-      add_row(n - u, c.d_normal - c.d_second, c.weight, a, b);
+      const real n = c.residual[0] + length * c.change[0];
+      UNROLLED for (int k = 1; k < DIRECTIONS; ++k) {
+        if (!c.exists || k > frictions(c)) break;
+        const real t = c.residual[k] + length * c.change[k];
+        add_row(n + t, c.change[0] + c.change[k], c.weight, a, b);
+        add_row(n - t, c.change[0] - c.change[k], c.weight, a, b);
+      }
       const Limit& l = limits[ME];
       add_row(l.residual + length * l.change, l.change, l.weight, a, b);
       first[ME] = a;
@@ -395,9 +431,7 @@ DEVICE void solve_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limi
     EACH_LANE {
       if (lane < NV) w.acceleration[lane] -= length * x[ME];
       Contact& c = contacts[ME];
-      c.normal += length * c.d_normal;
-      c.first += length * c.d_first;
-      c.second += length * c.d_second;
+      UNROLLED for (int k = 0; k < DIRECTIONS; ++k) c.residual[k] += length * c.change[k];
       limits[ME].residual += length * limits[ME].change;
     }
     MEET();

@@ -9,6 +9,9 @@ DEVICE void evaluate(World& w, bool last, const Outputs& out, bool& lost) {
   place_joints(w);
   place_bodies(w);
   sum_subtrees(w);
+#if SERVOS
+  find_drives(w);
+#endif
   find_forces(w);
   find_inertia(w);
   const unsigned existing = find_constraints(w, contacts, limits, lost);
@@ -30,35 +33,45 @@ DEVICE void evaluate(World& w, bool last, const Outputs& out, bool& lost) {
   MEET();
 }
 
+// A free joint's qpos, its first at address q, advanced by the rates from its first dof d on.
+DEVICE void advance_free_joint(World& w, int q, int d) {
+  const Vec spin = vec_at(w.rate + d + 3);
+  const real squared = dot(spin, spin);
+  real qw = w.start_qpos[q + 3];
+  Vec v = vec_at(w.start_qpos + q + 4);
+  if (squared > real(1e-30)) {
+    const real inverse = inverse_root(squared);
+    real s, c;
+    sine_cosine(real(0.5) * TIMESTEP * squared * inverse, &s, &c);
+    const Vec b = spin * (s * inverse);
+    const real turned = qw * c - dot(v, b);
+    v = b * qw + v * c + cross(v, b);
+    qw = turned;
+  }
+  const real norm = inverse_root(qw * qw + dot(v, v));
+  w.qpos[q + 3] = qw * norm;
+  put(w.qpos + q + 4, v * norm);
+}
+
 // qpos = start_qpos advanced by a time step of `rate` (mj_integratePos).
 DEVICE void advance(World& w) {
   EACH_LANE {
-    if (lane < JOINTS)
-      w.qpos[BASE_QPOS + lane] = w.start_qpos[BASE_QPOS + lane] + TIMESTEP * w.rate[BASE_DOFS + lane];
+    if (lane < JOINTS) {
+      const int q = joint_qpos(lane), d = joint_dof(lane);
+#if FREE_JOINTS
+      if (joint_kind(lane) == FREE_JOINT) {
+        put(w.qpos + q, vec_at(w.start_qpos + q) + vec_at(w.rate + d) * TIMESTEP);
+        advance_free_joint(w, q, d);
+      } else
+#endif
+        w.qpos[q] = w.start_qpos[q] + TIMESTEP * w.rate[d];
+    }
 #if FREE
     if (lane >= LANES - 3) {
       const int k = lane - (LANES - 3);
       w.qpos[k] = w.start_qpos[k] + TIMESTEP * w.rate[k];
     }
-    if (lane == LANES - 4) {
-      const Vec spin = vec_at(w.rate + 3);
-      const real squared = dot(spin, spin);
-      real qw = w.start_qpos[3];
-      Vec q = vec_at(w.start_qpos + 4);
-      if (squared > real(1e-30)) {
-        const real inverse = inverse_root(squared);
-        real s, c;
-        sine_cosine(real(0.5) * TIMESTEP * squared * inverse, &s, &c);
-        const Vec b = spin * (s * inverse);
-        const real w1 = qw * c - dot(q, b);
-        const Vec q1 = b * qw + q * c + cross(q, b);
-        const real norm = inverse_root(w1 * w1 + dot(q1, q1));
-        qw = w1 * norm;
-        q = q1 * norm;
-      }
-      w.qpos[3] = qw;
-      put(w.qpos + 4, q);
-    }
+    if (lane == LANES - 4) advance_free_joint(w, 0, 0);
 #endif
   }
   MEET();
@@ -76,11 +89,11 @@ DEVICE void start_step(World& w) {
 }
 
 #if RK4
-DEVICE void control_step(World& w, const Outputs& out, bool& lost) {
+DEVICE void take_substeps(World& w, const Outputs& out, bool& lost) {
   ROLLED for (int e = 0; e < 4 * SUBSTEPS; ++e) {
     const int stage = e & 3;
     if (stage == 0) start_step(w);
-    evaluate(w, e == 4 * SUBSTEPS - 1, out, lost);
+    evaluate(w, !FORWARD && e == 4 * SUBSTEPS - 1, out, lost);
     const bool outer_stage = stage == 0 || stage == 3;
     const real share = outer_stage ? real(1) / 6 : real(1) / 3, ahead = stage == 2 ? real(1) : real(0.5);
     EACH_LANE if (lane < NV) {
@@ -110,10 +123,10 @@ DEVICE void damp(World& w, PerLane<real>& x) {
   solve_tree(w, x);
 }
 
-DEVICE void control_step(World& w, const Outputs& out, bool& lost) {
+DEVICE void take_substeps(World& w, const Outputs& out, bool& lost) {
   ROLLED for (int e = 0; e < SUBSTEPS; ++e) {
     start_step(w);
-    evaluate(w, e == SUBSTEPS - 1, out, lost);
+    evaluate(w, !FORWARD && e == SUBSTEPS - 1, out, lost);
     PerLane<real> x;
     if constexpr (DAMPED)
       damp(w, x);
@@ -134,3 +147,14 @@ DEVICE void control_step(World& w, const Outputs& out, bool& lost) {
   }
 }
 #endif
+
+DEVICE void control_step(World& w, const Outputs& out, bool& lost) {
+  take_substeps(w, out, lost);
+#if FORWARD
+  EACH_LANE if (lane < NV) w.warmstart[lane] = w.qacc[lane];
+  MEET();
+  evaluate(w, true, out, lost);
+  EACH_LANE if (lane < NV) w.qacc[lane] = w.warmstart[lane];
+  MEET();
+#endif
+}

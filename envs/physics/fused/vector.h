@@ -19,10 +19,12 @@ typedef REAL Real;
 #define INLINE __forceinline__
 #define MEMBER __device__ __forceinline__
 #define FUNCTION static __device__ __forceinline__
+#define APART static __device__ __noinline__
 #else
 #define INLINE __attribute__((always_inline))
 #define MEMBER inline __attribute__((always_inline))
 #define FUNCTION static inline __attribute__((always_inline))
+#define APART static __attribute__((noinline, unused))
 #endif
 
 #ifndef WORLDS

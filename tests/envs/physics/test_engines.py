@@ -21,6 +21,7 @@ from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
+from native import compiled
 from paths import ROOT
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
@@ -104,12 +105,10 @@ def test_a_forward_pass_makes_readouts_those_of_the_new_state(readout, substeps)
     np.testing.assert_array_equal(out["torso"], after.qpos[:, :3])  # which RK4 alone leaves a stage behind
 
 
-def test_fused_has_no_forward_pass_and_auto_takes_another():
-    reason = contract.obstacle("fused", corridor.model(), {}, forward=True)
-    assert reason is not None and ("no forward pass" in reason or "compiler" in reason)
-    assert physics.resolve("auto", corridor.model(), {}, forward=True) == "mujoco"
-    with pytest.raises(TaskError, match="physics 'fused' "):
-        physics.make_engine(corridor.model(), substeps=5, readout={}, forward=True, physics="fused")
+@compiled
+def test_auto_takes_fused_for_steps_with_a_forward_pass():
+    assert contract.obstacle("fused", corridor.model(), {}, forward=True) is None
+    assert physics.resolve("auto", corridor.model(), {}, forward=True) == "fused"
 
 
 @both

@@ -23,6 +23,7 @@ from batches import assert_batches_agree, assert_same
 from envs import native, physics
 from envs.ant import walls
 from envs.errors import TaskError
+from envs.multi_goal import models as goals
 from envs.physics.contract import PhysicsState
 from envs.physics.fused import cpu
 from envs.physics.fused import model as tables_of
@@ -32,7 +33,7 @@ from envs.velocity import robots
 from native import compiled
 from paths import ROOT
 from pmt_jax import tasks
-from stepping import ROBOTS, THIN, answers, anywhere, by_c, check, kinds, model_of, readout_of, states
+from stepping import ROBOTS, THIN, answers, anywhere, by_c, check, crowded, exact, kinds, model_of, readout_of, states
 
 pytestmark = compiled
 
@@ -96,6 +97,37 @@ def test_the_float_build_is_mujocos_within_its_rounding(robot):
         check({"qpos": qpos, "qvel": qvel}, {k: theirs[k] for k in ("qpos", "qvel")}, 5e-5, share)
 
 
+@pytest.mark.parametrize(
+    ("robot", "vases"),
+    [
+        ("point", 2),
+        *(pytest.param("point", count, marks=pytest.mark.full) for count in (0, 1, 4, 10)),
+        *(pytest.param("ant", count, marks=pytest.mark.full) for count in (0, 1, 4)),
+    ],
+)
+def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
+    """Two robots among vases: several trees, boxes, all six directions of contacts, and a forward pass at the end."""
+    model, rows = exact(goals.model(robot, 2, vases, 1.5)), crowded(robot, vases, 90)
+    readout = {
+        "qacc": ("qacc", slice(None)),
+        "forces": ("cfrc_ext", slice(1, None)),
+        "motors": ("qfrc_actuator", slice(None)),
+    }
+    theirs = by_c(model, rows, 0, readout, forward=True)
+    assert (np.abs(theirs["forces"]).max((1, 2)) > 0).mean() > 0.3
+    theirs |= {"warmstart": rows[:, -model.nv - model.nu : len(rows[0]) - model.nu]}
+    check(by_fused(model, rows, 0, readout, forward=True), theirs, 1e-8, 0.02)
+    ours = by_fused(model, rows, goals.SUBSTEPS, readout, forward=True)
+    check(ours, by_c(model, rows, goals.SUBSTEPS, readout, forward=True), 1e-6, 0.05)
+    assert not ours["overflow"].any()
+    order = np.random.default_rng(0).permutation(len(rows))
+    mixed = rows[order]  # with other neighbours, some of them broken
+    mixed[::9, 1] = np.nan
+    again, whole = by_fused(model, mixed, goals.SUBSTEPS, readout, forward=True), np.isfinite(mixed).all(axis=1)
+    for name in ours:
+        np.testing.assert_array_equal(ours[name][order][whole], again[name][whole])
+
+
 SMALL = {
     "a free ball": "<body><freejoint/><geom size='.1'/></body>",
     "a free box of welded parts, damped": """
@@ -149,13 +181,28 @@ SMALL = {
           <body pos='.1 0 .2'><joint name='h' axis='1 0 0'/><geom size='.04' contype='1' conaffinity='1'/>
             <body pos='-.05 .1 0'><joint axis='0 1 0'/>
               <geom type='capsule' size='.03 .1' pos='0 0 -.08' contype='3' conaffinity='3'/></body></body></body>""",
+    "boxes on the floor, on one another and on a fixed box": """
+        <geom type='box' size='.2 .2 .1' pos='0 0 .1'/>
+        <body pos='.15 .03 .299' euler='0 0 20'><freejoint/><geom type='box' size='.1 .12 .1' condim='6'/></body>
+        <body pos='.6 0 .0995' euler='0 0 30'><freejoint/><geom type='box' size='.1 .1 .1'/></body>
+        <body pos='.65 .02 .2985'><freejoint/><geom type='box' size='.1 .1 .1' condim='4'/></body>""",
+    "free roots, contacts of all sizes, a fixed ball and servos": """
+        <geom size='.1' pos='0 0 .1'/>
+        <body pos='.195 0 .1' euler='10 20 30'><freejoint/><geom size='.1' condim='6' friction='.8 .02 .01'/></body>
+        <body pos='.388 0 .1'><freejoint/><geom type='capsule' size='.1 .1' euler='80 0 0' condim='4'/></body>
+        <body pos='.54 0 .2'><joint name='h' axis='0 1 0' stiffness='1'/><geom type='capsule' size='.06 .1' condim='1'/>
+          <body pos='0 0 .2'><joint name='i' type='slide' axis='0 1 1' damping='.1'/>
+            <geom type='box' size='.1 .05 .04'/><site name='s' pos='.1 .05 0' euler='10 20 30'/></body></body>""",
 }
+SERVOS = """<position joint='h' kp='2' kv='.1' forcerange='-1 1'/><velocity joint='i' kv='.3' gear='2'/>
+    <general site='s' gear='1 .5 -.3 .2 .1 .4' biastype='affine' biasprm='.1 0 -.2' ctrlrange='-1 1'
+      forcerange='-.6 .6'/>"""
 
 
-CONTACTS = dict(zip(list(SMALL)[3:], (2, 2, 1, 1, 2, 2, 2, 1), strict=True))  # of the reference pose
+CONTACTS = dict(zip(list(SMALL)[3:], (2, 2, 1, 1, 2, 2, 2, 1, 14, 5), strict=True))  # of the reference pose
 
 
-THIN_SMALL = (1, 4, 8, 10)  # the default tests of the other schedule have the rest
+THIN_SMALL = (1, 4, 8, 10, 12)  # the default tests of the other schedule have the rest
 
 
 @pytest.mark.parametrize(
@@ -163,11 +210,12 @@ THIN_SMALL = (1, 4, 8, 10)  # the default tests of the other schedule have the r
 )
 @pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.full)])
 def test_small_models_step_as_in_mujoco(kind, integrator):
-    motor = "<actuator><motor joint='h' gear='3'/></actuator>" if "'h'" in SMALL[kind] else ""
+    motor = "<motor joint='h' gear='3'/>" if "'h'" in SMALL[kind] else ""
+    motors = f"<actuator>{SERVOS if 'servos' in kind else motor}</actuator>"
     floor = "<geom type='plane' size='5 5 1' margin='.01'/>"
     option = f"<option integrator='{integrator}' timestep='.005' tolerance='0'/>"
     model = mujoco.MjModel.from_xml_string(
-        f"<mujoco>{option}<worldbody>{floor}{SMALL[kind]}</worldbody>{motor}</mujoco>"
+        f"<mujoco>{option}<worldbody>{floor}{SMALL[kind]}</worldbody>{motors}</mujoco>"
     )
     rng = np.random.default_rng(0)
     rows = np.zeros((60, model.nq + 2 * model.nv + model.nu))
@@ -326,18 +374,17 @@ def test_episodes_of_random_policies_have_the_statistics_of_c():
 # -- refusals --
 
 FLOOR = "<geom type='plane' size='1 1 1'/>"
+STIFF = "<joint armature='1'/>"
 REFUSED = {
     "joint 'b' is a ball joint": "<body><joint name='b' type='ball'/><geom size='.1'/></body>",
     "dry friction": "<body><joint frictionloss='1'/><geom size='.1'/></body>",
     "gravity compensation": "<body gravcomp='1'><joint/><geom size='.1'/></body>",
-    "free joint beside other trees": "<body><freejoint/><geom size='.1'/></body><body><joint/><geom size='.1'/></body>",
-    "(plane and box)": FLOOR + "<body pos='0 0 1'><joint/><geom type='box' size='.1 .1 .1'/></body>",
-    "condim 4": FLOOR + "<body pos='0 0 1'><joint/><geom size='.1' condim='4'/></body>",
+    "free joint with a spring": "<body><joint type='free' stiffness='1'/><geom size='.1'/></body>",
+    "(plane and cylinder)": FLOOR + "<body pos='0 0 1'><joint/><geom type='cylinder' size='.1 .1'/></body>",
+    "130 degrees of freedom": 26 * f"<body>{5 * STIFF}<geom size='.1' contype='0'/></body>",
     "not horizontal": "<geom type='plane' size='1 1 1' euler='9 0 0'/><body><joint/><geom size='.1'/></body>",
-    "(box and box)": "<geom type='box' size='1 1 1'/><body><joint/><geom type='box' size='.1 .1 .1'/></body>",
     "(ellipsoid and box)": """<geom type='box' size='1 1 1'/>
         <body><joint/><geom type='ellipsoid' size='.1 .2 .3'/></body>""",
-    "fixed to the world": "<geom size='.1'/><body pos='0 0 1'><freejoint/><geom size='.1'/></body>",
     "unusual solref or solimp": """<geom type='plane' size='1 1 1'/>
         <body pos='0 0 1'><joint/><geom size='.1' solimp='.9 .95 .001 .3 1'/></body>""",
 }
@@ -352,9 +399,10 @@ OPTIONS = {
 PARTS = {
     "tendons": "<tendon><fixed><joint joint='j' coef='1'/></fixed></tendon>",
     "equality constraints": "<equality><joint joint1='j'/></equality>",
-    "is no plain motor": "<actuator><position joint='j'/></actuator>",
+    "is no motor, position or speed servo": "<actuator><general joint='j' gaintype='affine'/></actuator>",
+    "'at' is no motor, position or speed servo": "<actuator><general name='at' site='s' refsite='r'/></actuator>",
 }
-PLAIN = "<body><joint name='j'/><geom size='.1'/></body>"
+PLAIN = "<site name='r'/><body><joint name='j'/><geom size='.1'/><site name='s'/></body>"
 
 
 def small(world: str = PLAIN, option: str = "", parts: str = "") -> mujoco.MjModel:
@@ -387,13 +435,15 @@ def test_readouts_it_does_not_know_are_refused_by_name():
         physics.make_engine(welded, substeps=1, readout={"x": ("subtree_com", 2)}, physics="fused")
 
 
-def test_ants_with_any_walls_take_fused_and_hands_take_mujoco():
+def test_robots_take_fused_and_hands_and_large_crowds_take_mujoco():
     assert envs.make("hand_over_2x6").engine == "mujoco"
     with pytest.raises(TaskError, match="physics 'fused' cannot step this model: it has tendons"):
         envs.make("hand_over_2x6", physics="fused")
     for kind in walls.WALLS:
         assert physics.resolve("auto", walls.model(kind), {"torso": ("xpos", 1)}) == "fused"
     assert physics.resolve("auto", robots.model("hopper")) == "fused"
+    for robot, number, vases, engine in (("point", 8, 4, "fused"), ("ant", 2, 10, "fused"), ("ant", 8, 4, "mujoco")):
+        assert physics.resolve("auto", goals.model(robot, number, vases, 2.0), forward=True) == engine
 
 
 # -- compiling --
@@ -501,7 +551,7 @@ def test_the_key_of_the_cache_has_all_that_the_library_depends_on(monkeypatch):
     keys += [native.key_of(compiler, cpu.code("tables", "float")), native.key_of(compiler._replace(version="2"), code)]
     monkeypatch.setattr(native, "cpu_flags", lambda: "of another CPU")
     keys.append(native.key_of(compiler, code))
-    monkeypatch.setattr(native, "installed_version", lambda name: "0.0.1")
+    monkeypatch.setattr(native, "installed_version", lambda name: f"{name} 0.0.1")
     keys.append(native.key_of(compiler, code))
     assert len(set(keys)) == len(keys)
 

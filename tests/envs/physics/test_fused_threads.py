@@ -9,10 +9,25 @@ import numpy as np
 import pytest
 
 from envs.errors import TaskError
+from envs.multi_goal import models as goals
 from envs.physics.fused import nvrtc, threads
 from envs.physics.fused.model import Tables, obstacle, tables
-from stepping import ROBOTS, THIN, Rows, answers, anywhere, by_c, errors, exact, kinds, model_of, readout_of, states
-from threads_on_cpu import compiled, runner
+from stepping import (
+    ROBOTS,
+    THIN,
+    Rows,
+    answers,
+    anywhere,
+    by_c,
+    crowded,
+    errors,
+    exact,
+    kinds,
+    model_of,
+    readout_of,
+    states,
+)
+from threads_on_cpu import compiled, runner, world_bytes
 
 
 @functools.cache
@@ -215,6 +230,52 @@ def test_capsules_and_spheres_touch_a_box_as_in_c(size):
     assert np.quantile(errors(single["warmstart"], right["warmstart"])[turned], 0.97) < 2e-3
 
 
+TWO_BOXES = """<mujoco><option timestep='.005'/><worldbody>
+  <geom type='box' size='.5 .3 .2' pos='1 2 3' euler='20 30 40' margin='.02'/>
+  <body><freejoint/><geom type='box' size='{size}' mass='1'/></body></worldbody></mujoco>"""
+
+
+@compiled
+@pytest.mark.parametrize("size", [".4 .3 .2", pytest.param("2 .05 .1", marks=pytest.mark.full)])
+def test_boxes_touch_boxes_as_in_c(size):
+    """Faces, edges and corners; every tenth pair has parallel axes, where the nearest is decided by rounding alone."""
+    model = exact(mujoco.MjModel.from_xml_string(TWO_BOXES.format(size=size)))
+    made_of, rows = tables(model, 1, FORCES_OF_THE_FREE), at_a_box(model, 1000)
+    right = flat(made_of, by_c(model, rows, 0, FORCES_OF_THE_FREE))
+    assert (np.abs(right["read"]).max(axis=1) > 0).mean() > 0.3
+    found, turned = by_threads(model, made_of, rows, whole=False), np.arange(len(rows)) % 10 != 0
+    for name in ("warmstart", "read"):
+        wrong = errors(found[name], right[name])
+        assert wrong[turned].max() < 1e-6 and np.quantile(wrong[~turned], 0.8) < 1e-6, name
+    assert not found["overflow"].any()
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("robot", "vases"),
+    [("point", 2), *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 0), ("point", 4), ("ant", 0)))],
+)
+def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
+    """Two robots among vases: several trees, boxes, all six directions of contacts, and a forward pass at the end."""
+    model, rows = exact(goals.model(robot, 2, vases, 1.5)), crowded(robot, vases, 90)
+    readout = {field: (field, slice(1, None)) for field in ("cfrc_ext", "xpos", "xquat", "cvel", "cinert")}
+    readout["qacc"] = ("qacc", slice(None))
+    made_of = tables(model, goals.SUBSTEPS, readout, forward=True)
+    assert threads.obstacle(made_of) is None
+    right = flat(made_of, by_c(model, rows, goals.SUBSTEPS, readout, forward=True))
+    found = by_threads(model, made_of, rows)
+    for name in ("qpos", "qvel", "warmstart", "read"):
+        assert np.quantile(errors(found[name], right[name]), 0.95) < 1e-6, name
+    assert not found["overflow"].any()
+    single = by_threads(model, made_of, rows, np.float32)
+    assert np.quantile(errors(single["qpos"], right["qpos"]), 0.9) < 2e-5
+
+
+def test_more_dofs_than_lanes_are_refused():
+    made_of = tables(goals.model("ant", 2, 1, 1.5), 1, {}, forward=True)
+    assert "34 degrees of freedom, and a warp takes 32" in str(threads.obstacle(made_of))
+
+
 # -- the order of elimination --
 
 
@@ -235,6 +296,23 @@ def test_more_bodies_than_lanes_are_refused():
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     reason = threads.obstacle(tables(model, 1, {}))
     assert reason is not None and "33 moving bodies" in reason and "32" in reason
+
+
+@compiled
+@pytest.mark.parametrize("robot", ["walls", *(pytest.param(x, marks=pytest.mark.full) for x in ROBOTS)])
+def test_the_bytes_of_a_world_are_as_counted(robot):
+    counted, right = threads.shared_bytes(made(robot)[1]), world_bytes(made(robot)[1])
+    assert right <= counted < 1.05 * right
+
+
+def test_more_bytes_than_a_block_has_are_refused():
+    joints = "<joint axis='0 1 0'/><joint axis='1 0 0'/>"
+    link = "<body pos='0 0 .2'>" + joints + "<geom type='capsule' size='.05 .1' condim='6'{}/>{}</body>"
+    chains = ""
+    for kind in (" contype='1' conaffinity='2'", " contype='2' conaffinity='1'"):
+        chains += functools.reduce(lambda inner, _, kind=kind: link.format(kind, inner), range(8), "")
+    made_of = tables(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{chains}</worldbody></mujoco>"), 1, {})
+    assert made_of.nv == 32 and "bytes, and a warp's memory has 49152" in str(threads.obstacle(made_of))
 
 
 def test_more_pairs_than_a_world_lists_are_refused():
@@ -262,6 +340,14 @@ def test_ptx_is_compiled_once_and_found_again(tmp_path, monkeypatch):
         nvrtc.step_ptx(source, "8.0")
     (kept,) = (tmp_path / "pmt-jax" / "fused").iterdir()
     assert kept.suffix == ".ptx"
+
+
+@nvidia
+@pytest.mark.parametrize(("robot", "vases"), [("point", 4), ("ant", 0)])
+def test_ptx_of_boxes_and_several_trees_is_compiled(robot, vases, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    made_of = tables(goals.model(robot, 2, vases, 1.5), goals.SUBSTEPS, {"qacc": ("qacc", slice(None))}, forward=True)
+    assert ".entry fused_step" in nvrtc.step_ptx(threads.source(made_of), "9.0")
 
 
 @nvidia
