@@ -226,6 +226,11 @@ class Config(Hyper):
     )
     activation: Literal["relu", "tanh", "elu"] = sizes("relu", "activation function of the hidden layers")
     layer_norm: bool = sizes(True, "layer normalisation after each hidden layer")
+    recurrent: Literal["none", "gru"] = sizes(
+        "none",
+        "gru: the last hidden layer of actors and critics is a gated recurrent unit, which remembers an episode; "
+        "minibatches are then whole sequences, equal parts of num_envs",
+    )
     obs_norm: Literal["running", "layernorm", "none"] = learning(
         "running", "observations are scaled by running moments, by layer normalisation, or not at all"
     )
@@ -366,3 +371,8 @@ def _validate_sizes(config: Config) -> None:
     for parts, what in ((config.minibatches, "equal minibatches"), (config.trust_steps, "trust steps")):
         if config.batch_size % parts:
             raise UsageError(f"a batch of {config.batch_size} steps cannot be cut into {parts} {what}; take a divisor")
+        if config.recurrent != "none" and config.num_envs % parts:
+            raise UsageError(
+                f"with recurrent = {config.recurrent} the sequences of num_envs = {config.num_envs} environments "
+                f"cannot be cut into {parts} {what}; take a divisor"
+            )

@@ -104,7 +104,12 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         constraint=constraint.init(setup, hyper),
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
-        rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
+        rollout=rollout.start(
+            setup.vector,
+            tagged[Tag.ENV],
+            setup.config.episode_starts == "spread",
+            setup.nets.start(setup.vector.num_envs),
+        ),
         key=tagged[Tag.UPDATE],
         update=jnp.zeros((), jnp.int32),
     )
@@ -118,6 +123,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     now = schedules.at(setup.config, hyper, state.update)
 
     # 1 Information source: the team acts.
+    memory = state.rollout.memory
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
@@ -127,9 +133,8 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     )
 
     # 3 Advantages of reward and of danger.
-    seen = critics.inputs(batch)
-    value, next_value = critics.values(state.critic, setup.nets.value, seen)
-    cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
+    (seen, value, next_value), cost_valued, after = critics.appraise(setup, state, batch, memory)
+    cost_seen, cost_value, next_cost_value = cost_valued
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
     advantage, returns = gae(batch.reward[..., None] if setup.own_critics else batch.reward, value, next_value, *ends)
     cost_advantage, cost_returns = gae(cost_signal, cost_value, next_cost_value, *ends)
@@ -140,10 +145,11 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     excess = constraint.cost_excess(estimate, constraint.target(hyper), horizon)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
     held = constraint.integrate(setup, hyper, state.constraint, excess)
-    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
+    signals = (advantage, cost_advantage, log_weight, memory and memory.actor)
+    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, *signals)
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
-    samples, cost_samples = (seen[0], value, returns), (seen[0], cost_value, cost_returns)
+    samples, cost_samples = (seen, value, returns), (cost_seen, cost_value, cost_returns)
     fit_critic = partial(critics.fit_critic, setup, hyper, now)
     cost_clip = jnp.where(jnp.isnan(hyper.cost_value_clip), hyper.clip, hyper.cost_value_clip)
     team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
@@ -157,9 +163,8 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     computed = {"batch": batch, "cost_signal": cost_signal, "log_weight": log_weight, "advantage": advantage}
     computed |= {"returns": returns, "cost_advantage": cost_advantage, "cost_returns": cost_returns}
     learned = {"critic": critic, "cost_critic": cost_critic, "fear": fear_net, "regret": regret_nets, "actor": actor}
-    learned |= {"constraint": held}
-    check_finite(setup, state.update, **computed, **learned)
-    state = dataclasses.replace(state, **learned, update=state.update + 1)
+    check_finite(setup, state.update, **computed, **learned, constraint=held)
+    state = dataclasses.replace(state, **learned, constraint=held, rollout=after, update=state.update + 1)
     return state, {
         **rollout.summary(batch, setup.shares_cost),
         **rollout.limit_metrics(batch, hyper),
@@ -189,7 +194,7 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
     after, batch, (obs, global_state) = rollout.collect(
         watched(setup, state.update),
         state.rollout,
-        lambda obs: setup.nets.policies(state.actor.params, obs),
+        partial(setup.nets.act, state.actor.params),
         normalisers,
         tagged[Tag.ACTION],
         setup.config.rollout_length,

@@ -14,10 +14,11 @@ from .maths import distributions
 from .maths.advantages import standardise
 from .maths.losses import clipped_penalty, clipped_surrogate, first_order_surrogate, hybrid_advantage
 from .optimise import Loss, fit
+from .rollout import flatten_steps
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_steps
-from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Tag, TrainState
+from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Sequences, Tag, TrainState
 
 
 class Team(NamedTuple):
@@ -52,12 +53,13 @@ def policy_samples(
     advantage: jax.Array,
     cost_advantage: jax.Array,
     log_weight: jax.Array,
+    hidden: jax.Array | None = None,
 ) -> PolicySamples:
-    """The batch as every agent's policy sees it, leaves [N, R, ...].
+    """The batch as every agent's policy sees it, leaves [N, R, ...]; of a recurrent one [N, B, T, ...].
 
     Args:
       price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of observations; cost_advantage:
-        [T, B, N, K]; log_weight: [T, B, N].
+        [T, B, N, K]; log_weight: [T, B, N]; hidden: [B, N, H] of recurrent actors before the batch, else None.
     """
     _, advantage = standardise(advantage)
     centred, scaled = standardise(cost_advantage, hyper.cost_std_floor)
@@ -68,7 +70,7 @@ def policy_samples(
     hybrid = hybrid_advantage(each * reward_weight, scaled, cost_weight)
     if setup.config.regret_response == "one_sided":
         log_weight = log_weight * jnp.sign(hybrid)
-    samples = PolicySamples(
+    each_agent = PolicySamples(
         obs=batch.obs,
         action=batch.action,
         mask=jnp.broadcast_to(jnp.asarray(setup.vector.spec.action_mask), batch.action.shape),
@@ -80,7 +82,11 @@ def policy_samples(
         log_weight=log_weight,
         factor=jnp.ones_like(batch.log_prob),
     )
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), samples)
+    if hidden is None:
+        return jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), each_agent)
+    samples = jax.tree.map(lambda x: x.transpose(2, 1, 0, *range(3, x.ndim)), each_agent)
+    done = jnp.broadcast_to(batch.done.T, samples.log_prob.shape)
+    return dataclasses.replace(samples, obs=Sequences(samples.obs, jnp.moveaxis(hidden, 1, 0), done))
 
 
 def _sequential(
@@ -182,7 +188,8 @@ def policy_loss(setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySample
       violation: see `update_policy`; only a penalty reads it.
     """
     penalised = setup.method.constraint == "penalty"
-    scale = jnp.maximum(samples.cost_advantage.std(0) + 1e-5, hyper.cost_std_floor) if penalised else 1.0
+    rows = tuple(range(samples.log_prob.ndim))
+    scale = jnp.maximum(samples.cost_advantage.std(rows) + 1e-5, hyper.cost_std_floor) if penalised else 1.0
 
     def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
         mean, std = setup.nets.policy(params, samples.obs)

@@ -47,9 +47,9 @@ def trust_region_steps(
       the network; [] cost per step, the most that a step promised to take off the cost; metrics. Means over steps.
     """
     start, unravel = ravel_pytree(net.params)
-    spread = samples.cost_advantage.std(0) + 1e-5
+    spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
     worst = jnp.argmax(violation / spread)
-    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[:, worst])
+    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst])
     steps = setup.config.trust_steps
     if steps > 1:
         shuffle = shuffled(key, samples.log_prob.shape[0])
