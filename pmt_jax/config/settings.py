@@ -159,6 +159,11 @@ class Config(Hyper):
     )
     activation: Literal["relu", "tanh", "elu"] = sizes("relu", "activation function of the hidden layers")
     layer_norm: bool = sizes(True, "layer normalisation after each hidden layer")
+    recurrent: Literal["none", "gru"] = sizes(
+        "none",
+        "gru: the last hidden layer of actors and critics is a gated recurrent unit, which remembers an episode; "
+        "minibatches are then whole sequences, equal parts of num_envs",
+    )
     obs_norm: Literal["running", "layernorm", "none"] = learning(
         "running", "observations are scaled by running moments, by layer normalisation, or not at all"
     )
@@ -260,8 +265,10 @@ def _validate_sizes(config: Config) -> None:
         )
     if config.num_updates > INT32_MAX:
         raise UsageError(f"steps = {config.steps} is more than 2**31 updates of {config.batch_size} steps")
-    if config.batch_size % config.minibatches:
-        raise UsageError(
-            f"a batch of {config.batch_size} steps cannot be cut into {config.minibatches} equal minibatches; "
-            "take a divisor"
-        )
+    sequences = [(config.num_envs, f"the sequences of {config.num_envs} environments")]
+    for count, what in [
+        (config.batch_size, f"a batch of {config.batch_size} steps"),
+        *(sequences if config.recurrent != "none" else ()),
+    ]:
+        if count % config.minibatches:
+            raise UsageError(f"{what} cannot be cut into {config.minibatches} equal minibatches; take a divisor")

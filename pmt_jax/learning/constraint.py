@@ -202,12 +202,13 @@ def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: 
     """The change in cost that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
 
     Args:
-      log_ratio, log_weight: [R], after the update; cost_advantage: [R, K], centred.
+      log_ratio, log_weight: [...], after the update; cost_advantage: [..., K], centred.
 
     Returns:
       [K] in units of the limit.
     """
-    return jnp.mean(jnp.exp(log_ratio + log_weight)[:, None] * cost_advantage, axis=0)
+    ratio = jnp.exp(log_ratio + log_weight)
+    return jnp.mean(ratio[..., None] * cost_advantage, axis=tuple(range(ratio.ndim)))
 
 
 def gain(setup: Setup, hyper: Hyper) -> jax.Array:

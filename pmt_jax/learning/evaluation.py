@@ -24,6 +24,8 @@ COUNTS = ("non_finite", "cost_out_of_range")  # of steps of an episode that brok
 STEP = "step/"  # before the names of what `play` records of every step
 
 Act = Callable[[tasks.State, jax.Array], jax.Array]  # state of all environments, step -> action [B, N, A]
+Hidden = jax.Array | None  # [B, N, H], what recurrent actors remember
+ActAndRecall = Callable[[tasks.State, jax.Array, Hidden], tuple[jax.Array, Hidden]]
 
 
 def evaluate(
@@ -54,16 +56,17 @@ def evaluate(
     hyper = setup.hyper if hyper is None else hyper
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
 
-    def act(env: tasks.State, t: jax.Array) -> jax.Array:
-        mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, env.obs))
+    def act(env: tasks.State, t: jax.Array, hidden: Hidden) -> tuple[jax.Array, Hidden]:
+        mean, std, hidden = setup.nets.act(state.actor.params, setup.scale(state.obs_moments, env.obs), hidden)
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(key, t), mean.shape)
-        return mean + std * noise
+        return mean + std * noise, hidden
 
     def observe(cost: jax.Array, t: jax.Array) -> jax.Array:
         step_key = jax.random.fold_in(jax.random.fold_in(key, Tag.OBSERVED_COST), t)
         return tasks.observed_cost(cost, step_key, hyper.cost_seen)
 
-    metrics, costs = _play(setup.vector.env, act, episodes, observe, fresh, record)
+    memory = setup.nets.start(episodes)
+    metrics, costs = _play(setup.vector.env, act, memory and memory.actor, episodes, observe, fresh, record)
     beyond = cost_beyond(*costs, hyper)
     return metrics | {"within_limit": jnp.all(beyond == 0, axis=(-2, -1)).astype(beyond.dtype)}
 
@@ -92,22 +95,33 @@ def play(
       also `step/NAME` [horizon, episodes, ...]: obs (before the action), next_obs (before any reset), action, reward,
       cost as observed, true_cost, terminated, truncated, info/NAME; 0 after an episode's end.
     """
-    return _play(env, act, episodes, observe, fresh, record)[0]
+    return _play(env, lambda state, t, _: (act(state, t), None), None, episodes, observe, fresh, record)[0]
 
 
 def _play(
-    env: tasks.Env, act: Act, episodes: int, observe: ObserveCost, fresh: bool, record: bool
+    env: tasks.Env,
+    act: ActAndRecall,
+    hidden: Hidden,
+    episodes: int,
+    observe: ObserveCost,
+    fresh: bool,
+    record: bool,
 ) -> tuple[Metrics, tuple[jax.Array, jax.Array]]:
-    """What `play` returns, and the episodes' costs [episodes, N, K], as observed and as they were."""
+    """What `play` returns, and the episodes' costs [episodes, N, K], as observed and as they were.
+
+    Args:
+      hidden: before the first step. It is never reset, because nothing counts after an environment's first episode.
+    """
     vector, spec = tasks.VectorEnv(env, episodes), env.spec
     mask = jnp.asarray(spec.action_mask)
     step_per_device = sharding.per_device(vector.step)
 
     def step(
-        carry: tuple[tasks.VectorState, jax.Array, Metrics], t: jax.Array
-    ) -> tuple[tuple[tasks.VectorState, jax.Array, Metrics], Metrics]:
-        state, alive, sums = carry
-        seen, action = state.env.obs, act(state.env, t) * mask
+        carry: tuple[tasks.VectorState, Hidden, jax.Array, Metrics], t: jax.Array
+    ) -> tuple[tuple[tasks.VectorState, Hidden, jax.Array, Metrics], Metrics]:
+        state, hidden, alive, sums = carry
+        action, hidden = act(state.env, t, hidden)
+        seen, action = state.env.obs, action * mask
         state, outcome = step_per_device(state, action)
         each = observe(outcome.cost, t)
         now = {
@@ -124,7 +138,7 @@ def _play(
         # No product: what is not finite, in `info`, times 0 is not 0.
         sums = {name: sums[name] + _masked(now[name], alive) for name in sums}
         kept = _recorded(seen, action, each, outcome, alive) if record else {}
-        return (state, alive & ~(outcome.terminated | outcome.truncated), sums), kept
+        return (state, hidden, alive & ~(outcome.terminated | outcome.truncated), sums), kept
 
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
     start = vector.reset(jax.random.fold_in(key, vector.horizon))
@@ -133,8 +147,8 @@ def _play(
     sums = {name: jnp.zeros(episodes, start.env.reward.dtype) for name in names}
     costs = ("episode_cost", "true_episode_cost")
     sums |= {name: jnp.zeros((episodes, spec.num_agents, spec.num_costs), start.env.reward.dtype) for name in costs}
-    carry = (start, jnp.ones(episodes, bool), sums)
-    (_, _, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
+    carry = (start, hidden, jnp.ones(episodes, bool), sums)
+    (*_, sums), kept = jax.lax.scan(step, carry, jnp.arange(vector.horizon))
     observed, true = (sums.pop(name) for name in costs)
     per_step = [name for name in sums if not name.startswith("episode_") and name not in COUNTS]
     found = {**sums, **{name: sums[name] / sums["episode_length"] for name in per_step}, **kept}

@@ -104,7 +104,12 @@ def init(setup: Setup, hyper: Hyper, key: jax.Array) -> LearnerState:
         largest_cost=jnp.zeros(heads),
         obs_moments=running_moments.init((spec.obs_dim,)),
         state_moments=running_moments.init((spec.state_dim,)),
-        rollout=rollout.start(setup.vector, tagged[Tag.ENV], setup.config.episode_starts == "spread"),
+        rollout=rollout.start(
+            setup.vector,
+            tagged[Tag.ENV],
+            setup.config.episode_starts == "spread",
+            setup.nets.start(setup.vector.num_envs),
+        ),
         key=tagged[Tag.UPDATE],
         update=jnp.zeros((), jnp.int32),
     )
@@ -124,6 +129,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     now = schedules.at(setup.config, hyper, state.update)
 
     # 1 Information source: the team acts.
+    memory = state.rollout.memory
     state, batch = act(setup, hyper, state, tagged)
 
     # 2 Threat appraisal: what counts as danger, and how much an action is regretted.
@@ -132,9 +138,8 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     (fear_net, cost_signal, fear_metrics), (regret_nets, log_weight, regret_metrics) = appraised
 
     # 3 Advantages of reward and of danger, which counts in units of the limit.
-    seen = critics.inputs(batch)
-    value, next_value = critics.values(state.critic, setup.nets.value, seen)
-    cost_value, next_cost_value = critics.values(state.cost_critic, setup.nets.cost_value, seen)
+    (seen, value, next_value), cost_valued, after = critics.appraise(setup, state, batch, memory)
+    cost_seen, cost_value, next_cost_value = cost_valued
     ends = (batch.terminated, batch.done, hyper.gamma, hyper.gae_lambda)
     cost_signal = constraint.in_unit(setup, hyper, cost_signal)
     advantage, returns = gae(batch.reward[..., None] if setup.own_critics else batch.reward, value, next_value, *ends)
@@ -146,22 +151,16 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     excess = constraint.cost_excess(setup, hyper, estimate)
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
     held = constraint.integrate(setup, hyper, state.constraint, excess)
-    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, advantage, cost_advantage, log_weight)
+    signals = (advantage, cost_advantage, log_weight, memory and memory.actor)
+    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, *signals)
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
-    samples, cost_samples = (seen[0], value, returns), (seen[0], cost_value, cost_returns)
-    fit_critic = partial(critics.fit_critic, setup, hyper, now)
+    samples, cost_samples = (seen, value, returns), (cost_seen, cost_value, cost_returns)
+    fit_critic, clip = partial(critics.fit_critic, setup, hyper, now), critics.clip_of_costs(setup, hyper)
     team = Team(state.actor, dataclasses.replace(held, estimate=estimate), actor_samples, excess)
     fitted = sharding.in_parallel(
         partial(fit_critic, state.critic, setup.nets.value, hyper.clip, samples, tagged[Tag.CRITIC]),
-        partial(
-            fit_critic,
-            state.cost_critic,
-            setup.nets.cost_value,
-            critics.UNCLIPPED,
-            cost_samples,
-            tagged[Tag.COST_CRITIC],
-        ),
+        partial(fit_critic, state.cost_critic, setup.nets.cost_value, clip, cost_samples, tagged[Tag.COST_CRITIC]),
         partial(update_policies, setup, hyper, now, team, tagged),
     )
     (critic, critic_metrics), (cost_critic, cost_critic_metrics), (actor, held, actor_metrics) = fitted
@@ -171,7 +170,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     learned = {"critic": critic, "cost_critic": cost_critic, "fear": fear_net, "regret": regret_nets, "actor": actor}
     learned |= {"constraint": held, "largest_cost": largest}
     check_finite(setup, state.update, **computed, **learned)
-    state = dataclasses.replace(state, **learned, update=state.update + 1)
+    state = dataclasses.replace(state, **learned, rollout=after, update=state.update + 1)
     return state, {
         **rollout.summary(batch, setup.shares_cost),
         **rollout.limit_metrics(batch, hyper),
@@ -222,7 +221,7 @@ def act(setup: Setup, hyper: Hyper, state: LearnerState, tagged: dict[Tag, jax.A
     after, batch, (obs, global_state) = rollout.collect(
         watched(setup, state.update),
         state.rollout,
-        lambda obs: setup.nets.policies(state.actor.params, obs),
+        partial(setup.nets.act, state.actor.params),
         normalisers,
         tagged[Tag.ACTION],
         setup.config.rollout_length,

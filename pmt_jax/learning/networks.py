@@ -15,8 +15,8 @@ from ..config.methods import Method
 from ..config.settings import Config
 from ..tasks import EnvSpec
 from . import fused
-from .maths import distributions
-from .types import Params
+from .maths import distributions, gru
+from .types import Memory, Params, Remembered, Seen, Sequences
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "tanh": nn.tanh, "elu": nn.elu}
 NORM_EPS = 1e-6
@@ -65,10 +65,47 @@ class MLP(nn.Module):
         return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_gain))(x)
 
 
+class Recurrent(nn.Module):
+    """An MLP whose last hidden layer is a gated recurrent unit; called, it takes the first step of an episode.
+
+    gates: all that is not recurrent, from the input to what it adds to the gates [..., 3H].
+    """
+
+    gates: MLP
+    outputs: int
+    head_gain: float
+
+    @property
+    def width(self) -> int:
+        """H."""
+        return self.gates.outputs // 3
+
+    def setup(self) -> None:
+        """Its own weights, next to those of `gates`."""
+        self.kernel = self.param("kernel", _orthogonal_gates, (self.width, 3 * self.width))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        self.norm = LayerNorm() if self.gates.layer_norm else None
+        self.head = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_gain))
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        gates = self.gates(x)
+        return self.read(gru.cell(gates, jnp.zeros_like(gates[..., : self.width]), self.kernel, self.bias))
+
+    def read(self, hidden: jax.Array) -> jax.Array:
+        """The outputs at hidden states [..., H]."""
+        return self.head(hidden if self.norm is None else self.norm(hidden))
+
+
+def _orthogonal_gates(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """[H, 3H], orthogonal for each gate, as in flax's `GRUCell`."""
+    make = nn.initializers.orthogonal()
+    return jnp.concatenate([make(k, (shape[0], shape[0])) for k in jax.random.split(key, 3)], 1)
+
+
 class Actor(nn.Module):
     """Mean of the Gaussian as a function of the observation; its standard deviation is a parameter of its own."""
 
-    trunk: MLP
+    trunk: MLP | Recurrent
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -85,6 +122,7 @@ class Networks:
       num_agents: N.
       own_critics: critics see an agent's own observation [O], not the state [S]; all agents share one.
       own_fear: each agent has a fear network of its own with heads [K], weights with a leading [N].
+      gates: of recurrent actors and critics, the layers up to their memory, the same for all; None if none remembers.
       fused: whether C++ code computes them where it can (see `fused`).
     """
 
@@ -96,10 +134,11 @@ class Networks:
     own_critics: bool
     own_fear: bool
     actor: Actor
-    critic: MLP
-    cost_critic: MLP
+    critic: MLP | Recurrent
+    cost_critic: MLP | Recurrent
     fear_net: MLP
     regret_net: MLP
+    gates: MLP | None = None
     fused: bool = False
 
     @property
@@ -167,17 +206,65 @@ class Networks:
         action_dim = self.actor.trunk.outputs
         return jax.vmap(lambda k: self.regret_net.init(k, jnp.zeros(self.state_dim + action_dim)))(keys)
 
-    def policy(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """One agent's Gaussian: obs [..., O] -> mean [..., A] and std [A]."""
-        if self._compiled:
+    def policy(self, params: Params, obs: jax.Array | Sequences) -> tuple[jax.Array, jax.Array]:
+        """One agent's Gaussian: obs [..., O], or sequences of them [B, T, O] -> mean [..., A] and std [A]."""
+        if self._compiled or isinstance(self.actor.trunk, Recurrent):
             layers = params["params"]
             return self._apply(self.actor.trunk, {"params": layers["trunk"]}, obs), distributions.std(layers["std"])
         return self.actor.apply(params, obs)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
 
-    def policies(self, params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """All agents' Gaussians: obs [..., N, O] -> mean [..., N, A] and std [N, A]."""
-        params = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])), params)
-        return jax.vmap(self.policy, in_axes=(0, -2), out_axes=(-2, 0))(params, obs)
+    def policies(self, params: Params, obs: jax.Array | Sequences) -> tuple[jax.Array, jax.Array]:
+        """All agents' Gaussians: obs [..., N, O], or sequences of them [B, T, N, O] -> mean [..., N, A], std [N, A]."""
+        axes: Any = Sequences(-2, -2, None) if isinstance(obs, Sequences) else -2  # pyright: ignore[reportArgumentType]
+        return jax.vmap(self.policy, in_axes=(0, axes), out_axes=(-2, 0))(self.of_all(params), obs)
+
+    def act(
+        self, params: Params, obs: jax.Array, hidden: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+        """One step of all agents: obs [..., N, O], hidden [..., N, H] -> mean [..., N, A], std [N, A], hidden after it.
+
+        Args:
+          hidden: that of `start`, and then what the step before returned, 0 where an episode begins; None of policies
+            that are not recurrent.
+        """
+        if hidden is None:
+            return *self.policies(params, obs), None
+
+        def one_agent(params: Params, obs: jax.Array, hidden: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            layers = params["params"]
+            trunk = {"params": layers["trunk"]}
+            hidden = self.advance(trunk, obs, hidden)
+            mean = self._apply(self.actor.trunk, trunk, Remembered(hidden))
+            return mean, distributions.std(layers["std"]), hidden
+
+        return jax.vmap(one_agent, (0, -2, -2), (-2, 0, -2))(self.of_all(params), obs, hidden)
+
+    def start(self, count: int) -> Memory | None:
+        """The memory of `count` environments where episodes begin; None if no network is recurrent."""
+        if self.gates is None:
+            return None
+        width = self.gates.outputs // 3
+        own = jnp.zeros((count, self.num_agents, width))
+        central = own if self.own_critics else jnp.zeros((count, width))
+        return Memory(own, central, central)
+
+    def advance(self, params: Params, x: jax.Array, hidden: jax.Array) -> jax.Array:
+        """What a recurrent network remembers after one more step: x [..., I], hidden [..., H] -> [..., H]."""
+        gates = self._gates(params, x)
+        if not self._compiled:
+            return gru.cell(gates, hidden, *_recurrence(params))
+        steps, before = gates.reshape(-1, 1, gates.shape[-1]), hidden.reshape(-1, hidden.shape[-1])
+        never = jnp.zeros(steps.shape[:2], bool)
+        return fused.unroll(steps, before, never, *_recurrence(params)).reshape(hidden.shape)
+
+    def remember(self, params: Params, seen: Sequences) -> jax.Array:
+        """What a recurrent network remembers after each step, before any reset: [B, T, ..., H]."""
+        unroll = fused.unroll if self._compiled else gru.unroll
+        return unroll(self._gates(params, seen.x), seen.hidden, seen.done, *_recurrence(params))
+
+    def of_all(self, params: Params) -> Params:
+        """An actor's weights with a leading [N], one shared by all agents included."""
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])), params)
 
     def is_std(self, params: Params) -> Params:
         """True at the weights of an actor's standard deviation: on these its Fisher matrix is diagonal."""
@@ -187,22 +274,30 @@ class Networks:
         """The mean's weights under plain names, for every layer i and with a leading [N].
 
         kernel_i [N, I, J] and bias_i [N, J]; norm_scale_i and norm_bias_i [N, I] if layer i's input is normalised.
+        Of a recurrent policy the last but one makes the gates [N, I, 3H], and recurrent_kernel [N, H, 3H] and
+        recurrent_bias [N, H] multiply the hidden state.
         """
         trunk = params["params"]["trunk"]
-        first = 0 if self.actor.trunk.input_norm else 1  # the first layer whose input may be normalised
+        mlp = self.gates or self.actor.trunk
+        assert isinstance(mlp, MLP)
+        first = 0 if mlp.input_norm else 1  # the first layer whose input may be normalised
+        inner = trunk if self.gates is None else trunk["gates"]
+        layers = [(inner[f"Dense_{i}"], inner.get(f"LayerNorm_{i - first}", {})) for i in range(len(mlp.hidden) + 1)]
         named = {}
-        for i in range(len(self.actor.trunk.hidden) + 1):
-            dense, norm = trunk[f"Dense_{i}"], trunk.get(f"LayerNorm_{i - first}", {})
+        if self.gates is not None:
+            layers.append((trunk["head"], trunk.get("norm", {})))
+            named = {"recurrent_kernel": trunk["kernel"], "recurrent_bias": trunk["bias"]}
+        for i, (dense, norm) in enumerate(layers):
             named |= {f"{name}_{i}": x for name, x in dense.items()}
             named |= {f"norm_{name}_{i}": x for name, x in norm.items()}
-        return {name: jnp.broadcast_to(x, (self.num_agents, *x.shape[1:])) for name, x in named.items()}
+        return self.of_all(named)
 
-    def value(self, params: Params, state: jax.Array) -> jax.Array:
-        """V in normalised units: state [..., S] -> [...], or observations [..., N, O] -> [..., N]."""
+    def value(self, params: Params, state: Seen) -> jax.Array:
+        """V in normalised units: state [..., S] -> [...], or observations [..., N, O] -> [..., N]; or sequences."""
         return self._apply(self.critic, params, state)[..., 0]
 
-    def cost_value(self, params: Params, state: jax.Array) -> jax.Array:
-        """Vc in normalised units: state [..., S] or observations [..., N, O] -> [..., N, K]."""
+    def cost_value(self, params: Params, state: Seen) -> jax.Array:
+        """Vc in normalised units: state [..., S] or observations [..., N, O] -> [..., N, K]; or sequences."""
         heads = self._apply(self.cost_critic, params, state)
         return heads if self.own_critics else heads.reshape(*heads.shape[:-1], self.num_agents, self.num_costs)
 
@@ -221,18 +316,37 @@ class Networks:
         """Logits of one agent's regret prior network: state [..., S], action [..., A] -> [..., A]."""
         return self._apply(self.regret_net, params, jnp.concatenate([state, action], -1))
 
-    def _apply(self, module: MLP, params: Params, x: jax.Array) -> jax.Array:
-        out: Any = fused.apply(module, params, x) if self._compiled else module.apply(params, x)
+    def _apply(self, module: MLP | Recurrent, params: Params, x: Seen) -> jax.Array:
+        out: Any
+        x = Remembered(self.remember(params, x)) if isinstance(x, Sequences) else x
+        if isinstance(x, Remembered):
+            out = module.apply(params, x.states, method="read")
+        else:
+            out = fused.apply(module, params, x) if self._compiled else module.apply(params, x)
         return out
+
+    def _gates(self, params: Params, x: jax.Array) -> jax.Array:
+        assert self.gates is not None
+        return self._apply(self.gates, {"params": params["params"]["gates"]}, x)
+
+
+def _recurrence(params: Params) -> tuple[jax.Array, jax.Array]:
+    """The weights of a recurrent network that multiply its hidden state."""
+    return params["params"]["kernel"], params["params"]["bias"]
 
 
 def build(config: Config, spec: EnvSpec, method: Method) -> Networks:
     """The networks of a run."""
     own_critics = method.critic == "observation"
 
-    def mlp(outputs: int, head_gain: float) -> MLP:
+    def mlp(outputs: int, head_gain: float, hidden: tuple[int, ...] = config.hidden) -> MLP:
         input_norm = config.obs_norm == "layernorm"
-        return MLP(config.hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
+        return MLP(hidden, outputs, head_gain, config.activation, config.layer_norm, input_norm)
+
+    gates = mlp(3 * config.hidden[-1], 1.0, config.hidden[:-1]) if config.recurrent == "gru" else None
+
+    def network(outputs: int, head_gain: float) -> MLP | Recurrent:
+        return mlp(outputs, head_gain) if gates is None else Recurrent(gates, outputs, head_gain)
 
     return Networks(
         num_actors=1 if method.share_actor else spec.num_agents,
@@ -242,9 +356,10 @@ def build(config: Config, spec: EnvSpec, method: Method) -> Networks:
         state_dim=spec.state_dim,
         own_critics=own_critics,
         own_fear=method.letter,
-        actor=Actor(mlp(spec.action_dim, 0.01)),
-        critic=mlp(1, 1.0),
-        cost_critic=mlp(spec.num_costs if own_critics else spec.num_agents * spec.num_costs, 1.0),
+        actor=Actor(network(spec.action_dim, 0.01)),
+        critic=network(1, 1.0),
+        cost_critic=network(spec.num_costs if own_critics else spec.num_agents * spec.num_costs, 1.0),
         fear_net=mlp(spec.num_costs if method.letter else spec.num_agents * spec.num_costs, 0.01),
         regret_net=mlp(spec.action_dim, 0.01),
+        gates=gates,
     )

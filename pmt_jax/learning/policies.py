@@ -14,10 +14,11 @@ from .maths import distributions
 from .maths.advantages import standardise
 from .maths.losses import clipped_penalty, clipped_surrogate, first_order_surrogate, hybrid_advantage
 from .optimise import Loss, fit
+from .rollout import flatten_steps
 from .schedules import Schedule
 from .setup import Setup
 from .trust_region import trust_region_step
-from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Tag, TrainState
+from .types import Batch, Constraint, Hyper, Metrics, Params, PolicySamples, Sequences, Tag, TrainState
 
 COST_STD_FLOOR = 2.0  # in units of the limit, so that a batch nearly without cost does not become noise of unit size
 
@@ -53,12 +54,14 @@ def policy_samples(
     advantage: jax.Array,
     cost_advantage: jax.Array,
     log_weight: jax.Array,
+    hidden: jax.Array | None = None,
 ) -> PolicySamples:
-    """The batch as every agent's policy sees it, leaves [N, R, ...].
+    """The batch as every agent's policy sees it, leaves [N, R, ...]; of a recurrent one [N, B, T, ...].
 
     Args:
       price: [N, K], what a cost counts; advantage: [T, B], or [T, B, N] of critics of observations; cost_advantage:
-        [T, B, N, K]; log_weight: [T, B, N], or with one that moves in the epochs [T, B, N, epochs + 1].
+        [T, B, N, K]; log_weight: [T, B, N], or with one that moves in the epochs [T, B, N, epochs + 1]; hidden:
+        [B, N, H] of recurrent actors before the batch, else None.
     """
     letter = setup.method.letter
     centred = scaled = cost_advantage
@@ -69,7 +72,7 @@ def policy_samples(
     each = advantage.reshape(*advantage.shape[:2], -1)
     hybrid = hybrid_advantage(each * reward_weight, scaled, cost_weight)
     moves = log_weight.ndim > batch.log_prob.ndim
-    samples = PolicySamples(
+    each_agent = PolicySamples(
         obs=batch.obs,
         action=batch.action,
         mask=jnp.broadcast_to(jnp.asarray(setup.vector.spec.action_mask), batch.action.shape),
@@ -83,7 +86,11 @@ def policy_samples(
         paid=jnp.sum(cost_weight * scaled, axis=-1) if letter else None,
         moving_log_weight=log_weight[..., :-1] if moves else None,
     )
-    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(-1, *x.shape[2:]), 1, 0), samples)
+    if hidden is None:
+        return jax.tree.map(lambda x: jnp.moveaxis(flatten_steps(x), 1, 0), each_agent)
+    samples = jax.tree.map(lambda x: x.transpose(2, 1, 0, *range(3, x.ndim)), each_agent)
+    done = jnp.broadcast_to(batch.done.T, samples.log_prob.shape)
+    return dataclasses.replace(samples, obs=Sequences(samples.obs, jnp.moveaxis(hidden, 1, 0), done))
 
 
 def _sequential(
@@ -211,7 +218,8 @@ def policy_loss(setup: Setup, hyper: Hyper, now: Schedule, samples: PolicySample
       violation: see `update_policy`; only a penalty reads it.
     """
     penalised = setup.method.constraint == "penalty"
-    scale = jnp.maximum(samples.cost_advantage.std(0) + 1e-5, COST_STD_FLOOR) if penalised else 1.0
+    rows = tuple(range(samples.log_prob.ndim))
+    scale = jnp.maximum(samples.cost_advantage.std(rows) + 1e-5, COST_STD_FLOOR) if penalised else 1.0
 
     def loss(params: Params, samples: PolicySamples) -> tuple[jax.Array, Metrics]:
         mean, std = setup.nets.policy(params, samples.obs)

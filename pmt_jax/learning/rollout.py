@@ -13,21 +13,24 @@ import numpy as np
 from .. import limits
 from ..tasks import Outcome, State, VectorEnv
 from . import sharding
-from .maths import distributions
+from .maths import distributions, gru
 from .setup import limit_less_margin
-from .types import Batch, Hyper, RolloutState
+from .types import Batch, Hyper, Memory, RolloutState, Sequences
 
-GaussianPolicy = Callable[[jax.Array], tuple[jax.Array, jax.Array]]  # obs [B, N, O] -> mean [B, N, A], std [N, A]
+Hidden = jax.Array | None  # [B, N, H]; None of policies that are not recurrent
+# obs [B, N, O], hidden -> mean [B, N, A], std [N, A], hidden
+GaussianPolicy = Callable[[jax.Array, Hidden], tuple[jax.Array, jax.Array, Hidden]]
 Normalise = Callable[[jax.Array], jax.Array]
 ObserveCost = Callable[[jax.Array, jax.Array], jax.Array]  # true cost [B, N, K], the step's number -> observed cost
 
 
-def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutState:
+def start(vector: VectorEnv, key: jax.Array, spread: bool = False, memory: Memory | None = None) -> RolloutState:
     """Fresh episodes everywhere, nothing summed yet.
 
     Args:
       spread: the time limit counts as if environment b of B had spent b / B of an episode, so that it ends episodes
         evenly over time. The first episodes are cut short by that, and no metric of episodes counts them.
+      memory: of recurrent networks, see `Networks.start`.
     """
     spec = vector.spec
     first = vector.reset(key)
@@ -42,6 +45,7 @@ def start(vector: VectorEnv, key: jax.Array, spread: bool = False) -> RolloutSta
         cost_sum=zeros,
         true_cost_sum=zeros,
         length=jnp.zeros(vector.num_envs, jnp.int32),
+        memory=memory,
     )
 
 
@@ -58,7 +62,7 @@ def collect(
     """`steps` control steps of all environments under `policy`, with actions drawn from `key`.
 
     Args:
-      policy: of normalised observations.
+      policy: of normalised observations, and of the actors' hidden states, which are reset where an episode ends.
       normalise: for observations and for global states.
       observe: what of a step's cost the learner observes; all of it by default.
       keep_next_obs: the batch has them, for critics of observations.
@@ -73,7 +77,7 @@ def collect(
     def step(state: RolloutState, t: jax.Array) -> tuple[RolloutState, tuple[Batch, tuple[jax.Array, jax.Array]]]:
         env: State = state.vector.env
         obs = normalise_obs(env.obs)
-        mean, std = policy(obs)
+        mean, std, hidden = policy(obs, state.memory and state.memory.actor)
         action = mean + std * jax.random.normal(jax.random.fold_in(key, t), mean.shape)
         next_vector, outcome = step_per_device(state.vector, action * mask)
         observed = observe(outcome.cost, t)
@@ -83,6 +87,7 @@ def collect(
             state.cost_sum + observed,
             state.true_cost_sum + outcome.cost,
             state.length + 1,
+            state.memory and dataclasses.replace(state.memory, actor=hidden),
         )
         seen = {
             "obs": obs,
@@ -123,7 +128,8 @@ def _clear_finished(sums: RolloutState, outcome: Outcome) -> RolloutState:
     going = ~(outcome.terminated | outcome.truncated)
     each = going[:, None, None]
     costs = (sums.cost_sum * each, sums.true_cost_sum * each)
-    return RolloutState(sums.vector, sums.reward_sum * going, *costs, sums.length * going)
+    memory = sums.memory and dataclasses.replace(sums.memory, actor=gru.reset(sums.memory.actor, ~going))
+    return RolloutState(sums.vector, sums.reward_sum * going, *costs, sums.length * going, memory)
 
 
 def finished_mean(batch: Batch, x: jax.Array) -> jax.Array:
@@ -204,3 +210,19 @@ def _worst_cost(batch: Batch) -> jax.Array:
 def flatten_steps(x: jax.Array) -> jax.Array:
     """[T, B, ...] as samples [R, ...]."""
     return x.reshape(-1, *x.shape[2:])
+
+
+def rows(tree: Any) -> Any:
+    """Arrays of a batch [T, B, ...] as rows to fit on: steps [T B, ...], or with `Sequences` among them [B, T, ...]."""
+
+    def is_whole(x: Any) -> bool:
+        return isinstance(x, Sequences)
+
+    whole = any(map(is_whole, jax.tree.leaves(tree, is_leaf=is_whole)))
+    arrange = (lambda x: x.swapaxes(0, 1)) if whole else flatten_steps
+    return jax.tree.map(lambda x: x if is_whole(x) else arrange(x), tree, is_leaf=is_whole)
+
+
+def sequences(x: jax.Array, hidden: jax.Array, done: jax.Array) -> Sequences:
+    """What a recurrent network saw in a batch: x [T, B, ...], done [T, B], and its `hidden` [B, ..., H] before it."""
+    return Sequences(x.swapaxes(0, 1), hidden, done.swapaxes(0, 1))

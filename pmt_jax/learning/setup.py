@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import numerics, tasks
-from ..config.methods import Method, find
+from ..config.methods import Method, find, label
 from ..config.settings import HYPER_FIELDS, Config, Hyper
 from ..errors import UsageError
 from ..limits import Limits
@@ -123,6 +123,10 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     else:
         tasks.check(env)
     _check_limits(config, env.spec)
+    if method.letter and config.recurrent != "none":
+        raise UsageError(
+            f"{label(config.method)} has the paper's networks, which remember nothing; leave out recurrent"
+        )
     nets = networks.build(config, env.spec, method)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
     return Setup(config, method, vector, nets)

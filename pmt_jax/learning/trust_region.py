@@ -43,9 +43,10 @@ def trust_region_step(
       the network; [] in units of the limit, the most that the step promised to take off the cost; metrics.
     """
     start, unravel = ravel_pytree(net.params)
-    worst = jnp.argmax(violation / (samples.cost_advantage.std(0) + 1e-5))
+    spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
+    worst = jnp.argmax(violation / spread)
     violation = violation[worst]
-    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[:, worst])
+    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst])
     samples, nets = sharding.shard(samples), setup.nets.plain  # the Fisher matrix takes second derivatives
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:

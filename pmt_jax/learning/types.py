@@ -67,11 +67,45 @@ class Critic:
 
 
 @pytree
+class Memory:
+    """Hidden states of recurrent networks before the next step of B environments, 0 where an episode begins.
+
+    actor: [B, N, H]; critic, cost_critic: [B, H], or [B, N, H] of critics of observations.
+    """
+
+    actor: jax.Array
+    critic: jax.Array
+    cost_critic: jax.Array
+
+
+@pytree
+class Sequences:
+    """What a recurrent network sees, in place of an array of single steps: whole sequences of environments.
+
+    x: [B, T, ..., I]; hidden: [B, ..., H] before the first step; done: [B, T] bool, an episode ends with this step.
+    """
+
+    x: jax.Array
+    hidden: jax.Array
+    done: jax.Array
+
+
+@pytree
+class Remembered:
+    """What a recurrent network reads its outputs from: hidden states [..., H] after the steps that are asked for."""
+
+    states: jax.Array
+
+
+Seen = jax.Array | Sequences | Remembered  # what a network computes from; the latter two of recurrent ones
+
+
+@pytree
 class RolloutState:
     """What the collection of experience carries from one update to the next.
 
     vector: B environments; reward_sum [B], cost_sum and true_cost_sum [B, N, K], length [B]: sums over the running
-    episodes.
+    episodes; memory: None without recurrent networks.
     """
 
     vector: VectorState
@@ -79,6 +113,7 @@ class RolloutState:
     cost_sum: jax.Array
     true_cost_sum: jax.Array
     length: jax.Array
+    memory: Memory | None = None
 
 
 @pytree
@@ -152,6 +187,8 @@ class Constraint:
 class PolicySamples:
     """The samples of a policy update; R = T * B samples, with a leading [N] before an agent is chosen.
 
+    Those of a recurrent policy are sequences: obs is `Sequences`, and [B, T] takes the place of [R].
+
     Attributes:
       obs: [R, O]; action: [R, A]; mask: [R, A]; log_prob: [R], mean: [R, A], std: [R, A] under the policy that acted.
       advantage: [R], hybrid: reward less weighted cost.
@@ -162,7 +199,7 @@ class PolicySamples:
       moving_log_weight: [R, epochs], the bias in each epoch; None if it is `log_weight` in all of them.
     """
 
-    obs: jax.Array
+    obs: jax.Array | Sequences
     action: jax.Array
     mask: jax.Array
     log_prob: jax.Array

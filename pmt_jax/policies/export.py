@@ -25,7 +25,8 @@ def export_policy(
 ) -> list[str]:
     """Writes a run's policy into the folder `out`, three files or four, and returns their names:
 
-    policy.stablehlo: `jax.export` of obs [batch, N, O] -> action [batch, N, A], f32, for CPU, CUDA, ROCm and TPU;
+    policy.stablehlo: `jax.export` of obs [batch, N, O] -> action [batch, N, A], f32, for CPU, CUDA, ROCm and TPU; of a
+      recurrent policy (obs, hidden [batch, N, H]) -> (action, hidden), which is 0 where an episode begins;
     policy.npz: its weights; numpy_policy.py: a loader of these in NumPy alone;
     policy.onnx: with `onnx` the same function as an ONNX graph, checked by onnxruntime before anything is written.
 
@@ -34,19 +35,21 @@ def export_policy(
     """
     setup, _, state = load_seed(folder, seed, which, physics="auto")  # nothing will be simulated
     spec = setup.vector.spec
-    batch = jax.export.symbolic_shape(f"batch, {spec.num_agents}, {spec.obs_dim}")
+    memory, (batch,) = setup.nets.start(1), jax.export.symbolic_shape("batch")
+    shapes = [(spec.num_agents, spec.obs_dim), *([memory.actor.shape[1:]] if memory else [])]
     program = jax.jit(jax.vmap(policy_function(setup, state)))
-    exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(batch, jnp.float32))
+    inputs = [jax.ShapeDtypeStruct((batch, *shape), jnp.float32) for shape in shapes]
+    exported = jax.export.export(program, platforms=PLATFORMS)(*inputs)
     named = weights(setup, state.actor.params, state.obs_moments)
     with writing_folder(out) as partial:
         (partial / "policy.stablehlo").write_bytes(exported.serialize())
         np.savez(partial / "policy.npz", **named)  # pyright: ignore[reportArgumentType] (its stub)
         (partial / "numpy_policy.py").write_text(inspect.getsource(numpy_policy))
         if onnx:
-            noise = np.random.default_rng(0).standard_normal((64, spec.num_agents, spec.obs_dim))
-            obs = np.asarray(named["obs_mean"] + named["obs_scale"] * noise, np.float32)
+            obs, *hidden = (np.random.default_rng(0).standard_normal((64, *shape)) for shape in shapes)
+            given = [np.asarray(x, np.float32) for x in (named["obs_mean"] + named["obs_scale"] * obs, *hidden)]
             onnx_policy.write(named, partial / "policy.onnx")
-            onnx_policy.check(partial / "policy.onnx", obs, np.asarray(program(obs)))
+            onnx_policy.check(partial / "policy.onnx", given, jax.tree.leaves(jax.device_get(program(*given))))
     return ["policy.stablehlo", "policy.npz", "numpy_policy.py", *(["policy.onnx"] if onnx else [])]
 
 

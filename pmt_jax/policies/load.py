@@ -5,6 +5,7 @@ from __future__ import annotations
 import pathlib
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from . import hub
 
 WHICH = ("last", "best")
 
-Policy = Callable[[jax.Array], jax.Array]
+Policy = Callable[..., Any]  # see `policy_function`
 
 
 def check_trusted(folder: pathlib.Path) -> None:
@@ -76,7 +77,8 @@ def load_policy(
 
     Returns:
       policy: raw observations obs [N, O] -> mean action [N, A], 0 where an agent has no such entry. Observations are
-        normalised inside; the task clips actions by its own rule.
+        normalised inside; the task clips actions by its own rule. One of a recurrent run is
+        (obs, hidden [N, H]) -> (action, hidden); without `hidden` an episode begins.
 
     Raises:
       UsageError: no run, no checkpoint, or no such seed.
@@ -103,12 +105,23 @@ def load_seed(
 
 
 def policy_function(setup: Setup, state: ActingState) -> Policy:
-    """The mean action of one seed's policy: obs [N, O] -> action [N, A], padded entries 0."""
+    """The mean action of one seed's policy: obs [N, O] -> action [N, A], padded entries 0.
+
+    A recurrent one is (obs, hidden [N, H]) -> (action, hidden); without `hidden` an episode begins.
+    """
     mask = jnp.asarray(setup.vector.spec.action_mask)
+    memory = setup.nets.start(1)
+
+    def act(obs: jax.Array, hidden: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
+        with jax.default_matmul_precision(MATMUL_PRECISION):
+            mean, _, hidden = setup.nets.act(state.actor.params, setup.scale(state.obs_moments, obs), hidden)
+        return mean * mask, hidden
 
     def policy(obs: jax.Array) -> jax.Array:
-        with jax.default_matmul_precision(MATMUL_PRECISION):
-            mean, _ = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, obs))
-        return mean * mask
+        return act(obs, None)[0]
 
-    return policy
+    def recurrent(obs: jax.Array, hidden: jax.Array | None = None) -> tuple[jax.Array, jax.Array | None]:
+        assert memory is not None
+        return act(obs, memory.actor[0] if hidden is None else hidden)
+
+    return policy if memory is None else recurrent

@@ -142,10 +142,13 @@ def action_change(run: Setup, packed: ActingState, original: ActingState, enviro
 
     def change(key: jax.Array, packed: ActingState, original: ActingState) -> jax.Array:
         normalisers = (functools.partial(run.scale, packed.obs_moments), lambda state: state)
-        policy = functools.partial(run.nets.policies, packed.actor.params)
-        start = rollout.start(vector, key)
+        policy = functools.partial(run.nets.act, packed.actor.params)
+        memory = run.nets.start(environments)
+        start = rollout.start(vector, key, memory=memory)
         _, batch, _ = rollout.collect(vector, start, policy, normalisers, key, vector.horizon)
-        moved = jnp.abs(run.nets.policies(original.actor.params, batch.obs)[0] - batch.mean)
+        seen = rollout.sequences(batch.obs, memory.actor, batch.done) if memory else batch.obs
+        mean = run.nets.policies(original.actor.params, seen)[0]
+        moved = jnp.abs((mean.swapaxes(0, 1) if memory else mean) - batch.mean)
         return (moved.mean((0, 1)) * vector.spec.action_mask).sum() / vector.spec.action_mask.sum()
 
     one = jax.tree.map(lambda x: x[0], (packed, original))

@@ -117,7 +117,7 @@ def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
     if shapes[0] != shapes[1]:
         raise UsageError(
             f"{name} of {source} has other shapes than this run's; start from a run of a task with the same "
-            "observations and agents, with the same hidden and layer_norm, and of a method that also "
+            "observations and agents, with the same hidden, layer_norm and recurrent, and of a method that also "
             "has one policy for all agents (mappo, ippo) or one for each (all others), and critics of the same "
             "(ippo and ippo_l have those of observations), and one fear network for all agents or one for each "
             "(f4sg_letter)"

@@ -114,15 +114,16 @@ def record(setup: Setup, state: ActingState, number: jax.Array, *, deterministic
         }
         return {"raw": raw, **step}
 
-    def step(s: tasks.State, t: jax.Array) -> tuple[tasks.State, dict[str, Any]]:
-        mean, std = setup.nets.policies(state.actor.params, setup.scale(state.obs_moments, s.obs[None]))
+    def step(now: tuple[tasks.State, Any], t: jax.Array) -> tuple[tuple[tasks.State, Any], dict[str, Any]]:
+        s, hidden = now
+        mean, std, hidden = setup.nets.act(state.actor.params, setup.scale(state.obs_moments, s.obs[None]), hidden)
         noise = 0.0 if deterministic else jax.random.normal(jax.random.fold_in(noise_key, t), mean.shape)
         action = (mean + std * noise)[0] * mask
         after = env.step(s, action)
-        return after, moment(after, action)
+        return (after, hidden), moment(after, action)
 
-    start = env.reset(start_key)
-    _, later = jax.lax.scan(step, start, jnp.arange(setup.vector.horizon))
+    start, memory = env.reset(start_key), setup.nets.start(1)
+    _, later = jax.lax.scan(step, (start, memory and memory.actor), jnp.arange(setup.vector.horizon))
     return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), moment(start, 0 * mask), later)
 
 

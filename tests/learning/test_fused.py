@@ -15,6 +15,7 @@ from envs import native
 from native import compiled
 from pmt_jax import load_config, tasks
 from pmt_jax.learning import fused, learner
+from pmt_jax.learning.maths import gru
 from pmt_jax.learning.networks import MLP
 from pmt_jax.learning.optimise import fit, init_train_state
 
@@ -75,6 +76,44 @@ def test_a_network_of_any_shape_has_xlas_outputs_and_gradients(inputs, hidden, o
     with jax.default_matmul_precision("highest"):
         expected = gradients(module.apply, params, x)
     assert_close(gradients(functools.partial(fused.apply, module), params, x), expected, 1e-4)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def along(unroll, hidden, done, *weights):
+    """Hidden states, and the gradient of a function in which each counts differently."""
+
+    def total(weights):
+        states = unroll(weights[0], hidden, done, *weights[1:])
+        return jnp.sum(jnp.cos(jnp.arange(states.size).reshape(states.shape)) * states), states
+
+    (_, states), gradient = jax.value_and_grad(total, has_aux=True)(weights)
+    return states, gradient
+
+
+def sequences(count, steps, agents, width):
+    """Hidden states, ends, gates, kernel and bias of a recurrent unit."""
+    key = functools.partial(jax.random.fold_in, jax.random.key(width))
+    gates = jax.random.normal(key(0), (count, steps, *agents, 3 * width))
+    hidden, done = jax.random.normal(key(1), (count, *agents, width)), jax.random.bernoulli(key(2), 0.2, (count, steps))
+    kernel, bias = jax.random.normal(key(3), (width, 3 * width)), jax.random.normal(key(4), (width,))
+    return hidden, done, gates, kernel / width**0.5, bias
+
+
+# Widths of whole vectors and of parts of them; sequences that fill a task and that do not.
+@pytest.mark.parametrize(("count", "agents", "width"), [(8, (), 16), (7, (2,), 13), (1, (), 1), (13, (3,), 40)])
+def test_a_recurrent_unit_has_xlas_states_and_gradients(count, agents, width):
+    given = sequences(count, 9, agents, width)
+    with jax.default_matmul_precision("highest"):
+        expected = along(gru.unroll, *given)
+    assert_close(along(fused.unroll, *given), expected)
+
+
+def test_recurrent_units_side_by_side_have_the_bits_of_each_alone():
+    first = sequences(7, 5, (), 13)
+    second = (first[0] + 1, ~first[1], *(x / 2 for x in first[2:]))
+    both = jax.vmap(functools.partial(along, fused.unroll))(*map(jnp.stack, zip(first, second, strict=True)))
+    for i, one in enumerate((first, second)):
+        np.testing.assert_array_equal(both[0][i], along(fused.unroll, *one)[0])
 
 
 @pytest.mark.parametrize("activation", fused.ACTIVATIONS)

@@ -298,8 +298,8 @@ def test_figures_of_episodes_count_finished_ones_only():
     vector = envs.vector.VectorEnv(envs.make("lane"), 8)
 
     def collect(state, key):
-        def stand_still(obs):
-            return jnp.zeros((8, 2, 2)), jnp.full((2, 2), 1e-3)
+        def stand_still(obs, hidden):
+            return jnp.zeros((8, 2, 2)), jnp.full((2, 2), 1e-3), hidden
 
         state, batch, _ = rollout.collect(vector, state, stand_still, (lambda x: x, lambda x: x), key, 10)
         return state, rollout.summary(batch)

@@ -69,9 +69,9 @@ def test_an_onnx_policy_that_differs_is_refused(tmp_path: pathlib.Path):
     np.savez(tmp_path / "policy.npz", **made)
     obs = np.ones((3, 2, 8), np.float32)
     action = numpy_policy.load(tmp_path / "policy.npz")(obs)
-    onnx_policy.check(tmp_path / "policy.onnx", obs, action)
+    onnx_policy.check(tmp_path / "policy.onnx", [obs], [action])
     with pytest.raises(ValueError, match="differ from the policy's by 0.001"):
-        onnx_policy.check(tmp_path / "policy.onnx", obs, action + 1e-3)
+        onnx_policy.check(tmp_path / "policy.onnx", [obs], [action + 1e-3])
 
 
 def test_onnx_without_its_extra(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch):
@@ -102,4 +102,4 @@ def test_weights_in_numpy_for_every_kind_of_network(changes: dict, tmp_path: pat
     if all(map(importlib.util.find_spec, ("onnx", "onnxruntime"))):
         onnx_policy.write(weights(run, params, moments), tmp_path / "policy.onnx")
         obs, expected = (np.asarray(x).reshape(12, 2, -1) for x in (obs, expected))
-        onnx_policy.check(tmp_path / "policy.onnx", obs, expected)
+        onnx_policy.check(tmp_path / "policy.onnx", [obs], [expected])

@@ -1,9 +1,10 @@
 """Networks in training by C++ code, on CPUs with a compiler: what XLA computes, to rounding, in half the time.
 
 XLA's products of small matrices and its many passes over the rows between them cost more than the arithmetic. Here a
-network's forward pass, its backward pass and Adam's step are a call each (mlp.cpp), over the threads of XLA's pool. The
-loss between them is JAX as ever, so any loss will do. A network's numbers depend neither on the number of threads nor
-on what is fitted next to it. Where nothing compiles, or the rows of a network are split over devices, XLA does it all.
+network's forward pass, its backward pass and Adam's step are a call each (mlp.cpp), over the threads of XLA's pool. So
+are all steps of a recurrent unit (gru.h). The loss between them is JAX as ever, so any loss will do. A network's
+numbers depend neither on the number of threads nor on what is fitted next to it. Where nothing compiles, or the rows of
+a network are split over devices, XLA does it all.
 """
 
 from __future__ import annotations
@@ -83,9 +84,9 @@ def available() -> bool:
 def function_names() -> list[str] | None:
     """The functions' names in XLA; None where no compiler makes them."""
     native = tasks.native()
-    headers = (HERE / name for name in ("activations.h", "adam.h", "matmul.h", "mlp.h", "passes.h"))
+    headers = (HERE / name for name in ("activations.h", "adam.h", "gru.h", "matmul.h", "mlp.h", "passes.h"))
     shared = (native.HEADER.parent / "physics" / "fused" / "vector.h", native.HEADER)
-    functions = ("mlp_forward", "mlp_backward", "adam_step")
+    functions = ("mlp_forward", "mlp_backward", "adam_step", "gru_forward", "gru_backward")
     code = native.Code("mlp", "the networks", (HERE / "mlp.cpp", *headers, *shared), functions, (), ("REAL=float",))
     try:
         return native.targets(code)
@@ -144,6 +145,51 @@ def _backward(shape: _Shape, kept: Any, gradient: jax.Array) -> tuple[list[jax.A
 
 
 _network.defvjp(_forward, _backward)
+
+
+# -- the gated recurrent unit --
+
+
+def unroll(gates: jax.Array, hidden: jax.Array, done: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """As `gru.unroll`, all steps in one call. Gates, kernel and bias have one gradient, hidden states have none."""
+    steps, between = gates.shape[1], gates.shape[2:-1]  # between: agents
+
+    def whole(x: jax.Array) -> jax.Array:  # [B, T, ..., I] as sequences [R, T, I]
+        return jnp.moveaxis(x, 1, -2).reshape(-1, steps, x.shape[-1])
+
+    going = jnp.broadcast_to(~done[(...,) + (None,) * len(between)], gates.shape[:-1])[..., None]
+    flat = hidden.reshape(-1, hidden.shape[-1])
+    states = _sequences(whole(gates), jax.lax.stop_gradient(flat), whole(going.astype(_F32))[..., 0], kernel, bias)
+    return jnp.moveaxis(states.reshape(gates.shape[0], *between, steps, -1), -2, 1)
+
+
+@jax.custom_vjp
+def _sequences(gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    return _sequences_forward(gates, hidden, going, kernel, bias)[0]
+
+
+def _sequences_forward(
+    gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array
+) -> tuple[jax.Array, Any]:
+    width, rows = hidden.shape[-1], gates.shape[:2]
+    sizes = ((*rows, width), (*rows, 4 * width), (3 * width * _wide(width),))
+    results = [jax.ShapeDtypeStruct(size, _F32) for size in sizes]
+    states, saved, _ = _call(3, results)(gates, hidden, going, kernel, bias)
+    return states, (states, saved, hidden, going, kernel)
+
+
+def _sequences_backward(kept: Any, gradient: jax.Array) -> tuple[jax.Array, ...]:
+    states, _, hidden, going, kernel = kept
+    width, rows = hidden.shape[-1], states.shape[:2]
+    sizes = ((*rows, 3 * width), (*rows, width), (3 * width * _wide(width),))
+    results = [jax.ShapeDtypeStruct(size, _F32) for size in sizes]
+    gates, own, _ = _call(4, results)(gradient, *kept)
+    before = jnp.concatenate([hidden[:, None], states[:, :-1] * going[:, :-1, None]], 1).reshape(-1, width)
+    inner = jnp.concatenate([gates[..., : 2 * width], own], -1).reshape(-1, 3 * width)
+    return gates, jnp.zeros_like(hidden), jnp.zeros_like(going), before.T @ inner, own.sum((0, 1))
+
+
+_sequences.defvjp(_sequences_forward, _sequences_backward)
 
 
 # -- Adam --

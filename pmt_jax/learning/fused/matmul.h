@@ -98,3 +98,15 @@ inline void pack(const float* from, long row, long column, long depth, long widt
     }
   }
 }
+
+// Memory of a thread, kept for its next task.
+inline float* memory(long size) {
+  static thread_local float* block;
+  static thread_local long held;
+  if (held < size) {
+    free(block);
+    block = (float*)aligned_alloc(64, (size * sizeof(float) + 63) / 64 * 64);
+    held = block ? size : 0;
+  }
+  return block;
+}

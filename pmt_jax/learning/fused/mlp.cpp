@@ -2,6 +2,7 @@
 // next to each other; each is computed in the same order whatever the number of networks and of threads.
 #include "native.h"
 #include "adam.h"
+#include "gru.h"
 #include "passes.h"
 
 namespace {
@@ -56,18 +57,6 @@ void forward_rows(const Call& call, const Shape& shape, const Saved& saved, cons
   if (call.activation == RELU) return forward<RELU>(shape, saved, x, out, first, rows);
   if (call.activation == TANH) return forward<TANH>(shape, saved, x, out, first, rows);
   return forward<ELU>(shape, saved, x, out, first, rows);
-}
-
-// Memory of a thread, kept for its next task.
-float* memory(long size) {
-  static thread_local float* block;
-  static thread_local long held;
-  if (held < size) {
-    free(block);
-    block = (float*)aligned_alloc(64, (size * sizeof(float) + 63) / 64 * 64);
-    held = block ? size : 0;
-  }
-  return block;
 }
 
 void forward_task(void* data, int phase, long index) {
@@ -246,4 +235,49 @@ EXPORTED XLA_FFI_Error* mlp_backward(XLA_FFI_CallFrame* frame) {
 EXPORTED XLA_FFI_Error* adam_step(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   return adam::call(frame);
+}
+
+// gates [..., B, T, 3H], hidden [..., B, H], going [..., B, T], kernel [..., H, 3H] and bias [..., H] to states
+// [..., B, T, H], what a backward pass needs [..., B, T, 4H], and memory for the packed kernel.
+EXPORTED XLA_FFI_Error* gru_forward(XLA_FFI_CallFrame* frame) {
+  if (native::is_query(frame)) return nullptr;
+  gru::Call call = {};
+  if (frame->args.size != 5 || frame->rets.size != 3 || !gru::sizes(operand(frame, 0), call)) {
+    return native::failure(frame->api, "gru_forward: wrong arguments");
+  }
+  call.gates = floats(operand(frame, 0)), call.hidden = floats(operand(frame, 1)), call.going = floats(operand(frame, 2));
+  call.kernel = floats(operand(frame, 3)), call.bias = floats(operand(frame, 4));
+  call.new_states = (float*)result(frame, 0)->data, call.new_saved = (float*)result(frame, 1)->data;
+  call.packed = (float*)result(frame, 2)->data;
+  const long rows = call.networks * call.sequences, h = call.width;
+  if (!has(operand(frame, 1), rows * h) || !has(operand(frame, 2), rows * call.steps) || !call.gates ||
+      !has(operand(frame, 3), call.networks * 3 * h * h) || !has(operand(frame, 4), call.networks * h) ||
+      !has(result(frame, 0), rows * call.steps * h) || !has(result(frame, 1), rows * call.steps * 4 * h) ||
+      !has(result(frame, 2), call.networks * call.packed_size())) {
+    return native::failure(frame->api, "gru_forward: wrong shapes or types");
+  }
+  return native::run(frame, gru::task, &call, {call.networks * 3, call.networks * call.tasks()}, 0);
+}
+
+// The gradient of states [..., B, T, H], these, what the forward pass saved, hidden, going and kernel to the gradient of
+// gates [..., B, T, 3H], that of what r multiplies [..., B, T, H], and memory for the packed kernel.
+EXPORTED XLA_FFI_Error* gru_backward(XLA_FFI_CallFrame* frame) {
+  if (native::is_query(frame)) return nullptr;
+  gru::Call call = {};
+  if (frame->args.size != 6 || frame->rets.size != 3 || !gru::sizes(result(frame, 0), call)) {
+    return native::failure(frame->api, "gru_backward: wrong arguments");
+  }
+  call.gradient = floats(operand(frame, 0)), call.states = floats(operand(frame, 1));
+  call.saved = floats(operand(frame, 2)), call.hidden = floats(operand(frame, 3));
+  call.going = floats(operand(frame, 4)), call.kernel = floats(operand(frame, 5));
+  call.gate_gradient = (float*)result(frame, 0)->data, call.inner_gradient = (float*)result(frame, 1)->data;
+  call.packed = (float*)result(frame, 2)->data;
+  const long rows = call.networks * call.sequences, h = call.width;
+  if (!has(operand(frame, 0), rows * call.steps * h) || !has(operand(frame, 1), rows * call.steps * h) ||
+      !has(operand(frame, 2), rows * call.steps * 4 * h) || !has(operand(frame, 3), rows * h) ||
+      !has(operand(frame, 4), rows * call.steps) || !has(operand(frame, 5), call.networks * 3 * h * h) ||
+      !has(result(frame, 1), rows * call.steps * h) || !has(result(frame, 2), call.networks * call.packed_size())) {
+    return native::failure(frame->api, "gru_backward: wrong shapes or types");
+  }
+  return native::run(frame, gru::task, &call, {call.networks * 3, call.networks * call.tasks()}, 0);
 }

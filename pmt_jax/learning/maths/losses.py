@@ -56,12 +56,12 @@ def clipped_penalty(
     limit (Zhang et al., 2022, section 4; Theorem 1: exact once its weight is at least the optimal multiplier).
 
     Args:
-      log_ratio, log_weight, factor: [R], see `clipped_surrogate`; clip: eps.
-      cost_advantage: [R, K], centred; excess: [K], S in cost per step; the two in one unit, like a standard deviation.
+      log_ratio, log_weight, factor: [...], see `clipped_surrogate`; clip: eps.
+      cost_advantage: [..., K], centred; excess: [K], S in cost per step; both in one unit, like a standard deviation.
     """
-    ratio = jnp.exp(log_ratio + log_weight)[:, None]
+    ratio = jnp.exp(log_ratio + log_weight)[..., None]
     each = jnp.maximum(ratio * cost_advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * cost_advantage)
-    return jnp.maximum((factor[:, None] * each).mean(0) + excess, 0.0).sum()
+    return jnp.maximum((factor[..., None] * each).mean(tuple(range(factor.ndim))) + excess, 0.0).sum()
 
 
 def first_order_surrogate(
