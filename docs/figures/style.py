@@ -28,7 +28,7 @@ def label_lines(axis: Any, ends: Sequence[tuple[str, float]]) -> None:
     to_axis = axis.transData + axis.transAxes.inverted()
     heights = sorted((float(to_axis.transform((axis.get_xlim()[1], y))[1]), y, method) for method, y in ends)
     places = np.array([min(max(height, 0.0), 1.0) for height, _, _ in heights])
-    for _ in range(200):  # neighbours that are too near push each other away
+    for _ in range(max(200, len(places) ** 2)):  # neighbours that are too near push each other away
         for low in range(len(places) - 1):
             lack = GAP - (places[low + 1] - places[low])
             if lack > 1e-4:
