@@ -322,7 +322,8 @@ class Networks:
         if isinstance(x, Remembered):
             out = module.apply(params, x.states, method="read")
         else:
-            out = fused.apply(module, params, x) if self._compiled else module.apply(params, x)
+            compiled = self._compiled and isinstance(module, MLP)
+            out = fused.apply(module, params, x) if compiled else module.apply(params, x)
         return out
 
     def _gates(self, params: Params, x: jax.Array) -> jax.Array:
