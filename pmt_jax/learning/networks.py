@@ -321,9 +321,10 @@ class Networks:
         x = Remembered(self.remember(params, x)) if isinstance(x, Sequences) else x
         if isinstance(x, Remembered):
             out = module.apply(params, x.states, method="read")
+        elif self._compiled and isinstance(module, MLP):
+            out = fused.apply(module, params, x)
         else:
-            compiled = self._compiled and isinstance(module, MLP)
-            out = fused.apply(module, params, x) if compiled else module.apply(params, x)
+            out = module.apply(params, x)
         return out
 
     def _gates(self, params: Params, x: jax.Array) -> jax.Array:
