@@ -126,7 +126,7 @@ def fit_critic(
 def clip_of_costs(setup: Setup, hyper: Hyper) -> jax.Array:
     """How far a cost value may profit from moving, in normalised units: at will, but with the letter.
 
-    The clip of Eq. 12 lets a value move by little more than itself in an update, too slowly for rare costs. Without it
+    The paper's clip lets a value move by little more than itself in an update, too slowly for rare costs. Without it
     teams had a third to two fifths less cost while they learned, and no other difference was found
     (docs/results/limits.md).
     """

@@ -391,7 +391,7 @@ def stored() -> dict[str, list[runs.Run]]:
 
 
 # Settings that stored runs have and the program no longer.
-GONE = {"cost_false", "lambda_rule", "cost_advantage", "fear_history", "regret_mask", "regret_target"}
+GONE = {*runs.OLD, "temperature", "fear_loss", "fear_l2", "regret_l2", "regret_max", "regret_response"}
 
 
 @pytest.mark.parametrize("name", stored())

@@ -26,7 +26,7 @@ def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
     at = [out.index(f"\n{group}:\n") for group in GROUPS]
     assert at == sorted(at) and out.index("--method") < out.index("--num-envs") < out.index("--lambda-lr")
     words = " ".join(out.split())
-    assert "step of the multiplier per update" in words
+    assert "how far costs of twice the limit in every update" in words
     assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
 
 

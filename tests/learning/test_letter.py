@@ -47,7 +47,9 @@ def appraise(part: str):
 
     @jax.jit
     def appraised(hyper, net, batch, key):
-        return of(made.setup, hyper, schedules.at(made.setup.config, hyper, jnp.int32(0)), net, batch, key)
+        now = schedules.at(made.setup.config, hyper, jnp.int32(0))
+        largest = (jnp.ones((2, 1)),) if part == "fear" else ()
+        return of(made.setup, hyper, now, net, batch, *largest, key)
 
     return appraised
 
@@ -124,7 +126,7 @@ def test_the_replay_buffer_has_the_latest_updates_and_nothing_is_drawn_that_was_
 
 def test_of_a_large_batch_the_replay_buffer_has_a_random_part():
     made = make_setup(load_config("switch", "f4sg_letter", num_envs=128, rollout_length=25))
-    net = jax.eval_shape(functools.partial(letter.init_fear, made), made.hyper, jax.random.key(0))
+    net = jax.eval_shape(functools.partial(letter.init_fear, made), jax.random.key(0))
     assert net.state.shape == (letter.UPDATES, letter.MOST_STATES, made.vector.spec.state_dim)
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), net)
     rows = jnp.zeros((3200, made.vector.spec.state_dim)).at[:, 0].set(jnp.arange(3200.0))

@@ -98,7 +98,7 @@ def test_what_a_task_declares_is_drawn():
 
 
 def test_long_names_of_many_runs_stand_below_one_another_and_within_the_picture(tmp_path: pathlib.Path):
-    config = 'task = "lane"\nlr_half_life = {0}\ncritic_lr = {0}\nclip = {0}\ngamma = 0.{0}\n'
+    config = 'task = "lane"\nemotion_lr = {0}\ncritic_lr = {0}\nclip = {0}\ngamma = 0.{0}\n'
     folders = [written(tmp_path / f"{i}", [row(10, 0, 1.0)], config.format(i)) for i in range(1, 9)]
     out = tmp_path / "curves.svg"
     plot.plot(folders, out)

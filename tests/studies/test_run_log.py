@@ -75,10 +75,10 @@ def test_runs_that_differ_in_seeds_alone_are_one_group(tmp_path: pathlib.Path):
 
 def test_settings_that_a_run_does_not_name_have_their_defaults(tmp_path: pathlib.Path):
     config = 'task = "lane"\nlambda_lr = 0.1\n'
-    texts = (config, config + "lr_half_life = inf\nseed = 1\n", config + "lr_half_life = 1e6\n[env]\nnum_agents = 3\n")
+    texts = (config, config + "lr_end = 1.0\nseed = 1\n", config + "lr_end = 0.5\n[env]\nnum_agents = 3\n")
     runs = [run_log.read(written(tmp_path / f"{i}", [row(10, i, 1.0)], text)) for i, text in enumerate(texts)]
     labels = [group.label for group in run_log.groups(runs)]
-    assert labels == ["mappo_l env.num_agents=default lr_half_life=inf", "mappo_l env.num_agents=3 lr_half_life=1e+06"]
+    assert labels == ["mappo_l env.num_agents=default lr_end=1", "mappo_l env.num_agents=3 lr_end=0.5"]
 
 
 def test_a_run_that_was_trained_twice_counts_once(tmp_path: pathlib.Path):

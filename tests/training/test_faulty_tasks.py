@@ -19,7 +19,7 @@ from pmt_jax.learning.evaluation import play
 from pmt_jax.training import health
 from runs import TINY, rows
 
-RUN = (*TINY, "--method", "mappo", "--steps", 400, "--seeds", 2, "--no-cache")
+RUN = (*TINY, "--method", "mappo", "--steps", 400, "--seeds", 2, "--no-cache", "--episode-starts", "together")
 
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

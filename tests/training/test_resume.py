@@ -261,7 +261,7 @@ def test_a_run_that_has_ended_says_what_would_train(copy: pathlib.Path, cli):
     [
         (("--seed", 5), "--change cannot change seed; leave them as they are"),
         (("--rollout-length", 10), "--change cannot change rollout_length; leave them as they are"),
-        (("--episode-starts", "spread"), "--change cannot change episode_starts; leave them as they are"),
+        (("--episode-starts", "together"), "--change cannot change episode_starts; leave them as they are"),
         pytest.param(("--steps", STEPS + 200, "--hidden", 16), "expected float32", marks=pytest.mark.full),
     ],
 )
