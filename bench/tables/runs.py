@@ -42,6 +42,8 @@ OLD |= {"cost_value_clip": math.nan, "max_grad_norm": 10.0, "lambda_kp": 0.0, "l
 OLD |= {"cost_std_floor": 0.05, "cost_estimate": "episode", "episode_starts": "together", "lr_half_life": math.inf}
 OLD |= {"kl_half_life": math.inf, "std_half_life": math.inf, "std_decay_start": 0.0, "actor_lr_half_life": math.inf}
 OLD |= {"value_norm_decay": 0.995, "limit_windup": 1.0, "lambda_lr": 0.1, "surrogate_weight": 1.0, "lambda_kd": 0.0}
+OLD |= {"fear_l2": 1.0, "regret_l2": 1.0, "temperature": 0.5, "regret_max": 0.9, "regret_response": "letter"}
+OLD |= {"fear_loss": "ce", "cost_margin": 0.0, "lambda_init": 0.78}
 OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}

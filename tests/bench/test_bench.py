@@ -391,7 +391,7 @@ def stored() -> dict[str, list[runs.Run]]:
 
 
 # Settings that stored runs have and the program no longer.
-GONE = {*runs.OLD, "temperature", "fear_loss", "fear_l2", "regret_l2", "regret_max", "regret_response"}
+GONE = {*runs.OLD}
 
 
 @pytest.mark.parametrize("name", stored())
