@@ -53,7 +53,7 @@ def in_unit(setup: Setup, hyper: Hyper, cost: jax.Array) -> jax.Array:
 
 
 def goal(setup: Setup, hyper: Hyper) -> jax.Array:
-    """What a step's cost is held to in its unit, [] or [K]: 1, or 0 for a limit of 0; by the letter d / L."""
+    """What a step's cost is held to in its unit, [] or [K]: 1, or 0 for a limit of 0; with the letter d / L."""
     limit = target(hyper)
     return limit / setup.vector.horizon if setup.method.letter else (limit > 0).astype(jnp.float32)
 
@@ -63,7 +63,7 @@ def estimate_cost(setup: Setup, hyper: Hyper, batch: Batch, previous: jax.Array,
 
     It is a moving average in which a batch has the weight of its share of an episode's time. It needs no episode that
     ends, and no batch that sees all parts of one. Where few batches have costs, an excess that is cut would be lower on
-    average without it. By the letter it is (1 - gamma) times the mean value, as in the excess of the paper.
+    average without it. With the letter it is (1 - gamma) times the mean value, as in the excess of the paper.
 
     Args:
       previous: [N, K], the estimate before; cost_value: [T, B, N, K] of the batch's states.
