@@ -1,6 +1,6 @@
 """Methods learn: small networks come near the optima of the toys (envs/toys.py has them).
 
-Next to every bound stand the mean and the standard deviation of 8 or 16 seeds' figures; a bound is at least three standard
+Next to every bound stand the mean and the standard deviation of 8 or 16 seeds; a bound is at least three standard
 deviations away from the mean.
 """
 
