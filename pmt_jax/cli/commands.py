@@ -16,7 +16,7 @@ from ..output import result
 from ..tasks import did_you_mean
 from ..tasks import names as task_names
 from . import doctor, pictures, policies, studies, tasks, train
-from .parser import HELP, Parser, command, refuse_unknown
+from .parser import EVERYTHING, HELP, Parser, command, refuse_unknown
 from .process import answer, interruptible
 
 SHELLS = ("bash", "zsh", "fish")
@@ -70,8 +70,11 @@ def run_completion(arguments: argparse.Namespace) -> int:
 def _run(argv: Sequence[str]) -> int:
     parser, commands = make_parser()
     refuse_unknown(argv, commands)
-    asked = [word for word in argv if word in HELP][:1]  # last, so that it knows the other words
-    arguments = parser.parse_all([word for word in argv if word not in HELP] + asked)
+    asked = next((i for i, word in enumerate(argv) if word in HELP), None)
+    if asked is not None:  # last, so that it knows the other words
+        end = asked + 1 + (list(argv[asked + 1 : asked + 2]) == [EVERYTHING])
+        argv = [*argv[:asked], *(word for word in argv[end:] if word not in HELP), *argv[asked:end]]
+    arguments = parser.parse_all(argv)
     if arguments.command is None:
         parser.print_help()
         return 0

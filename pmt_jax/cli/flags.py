@@ -11,10 +11,12 @@ from ..config.fields import GROUPS
 from ..config.load import expectation, load_config
 from ..config.methods import METHODS
 from ..config.settings import FIELDS, Config
-from .parser import HELP, path
+from .parser import EVERYTHING, HELP, path
 
 _METAVARS = {int: "N", float: "X"}
 _PATHS = ("init", "init_fear")
+_FIRST = ("method", "steps", "seeds", "seed", "num_envs", "rollout_length", "hidden", "actor_lr", "cost_limit")
+_FIRST += ("cost_margin", "physics", "env")  # what most people set, and `--help` without `all` shows
 _PREFIX = "set_"  # of the names under which argparse keeps settings
 
 
@@ -24,7 +26,11 @@ def add_settings(parser: argparse.ArgumentParser) -> dict[str, argparse._Argumen
     The parser is made with add_help=False.
     """
     groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
-    parser.add_argument(*HELP, action=_Help, help="shows this; after a TASK with the task's own defaults")
+    parser.add_argument(
+        *HELP,
+        action=_Help,
+        help="shows what most people set, or with `--help all` everything; after a TASK with the task's own defaults",
+    )
     presets = "; ".join(f"{name}: {about}" for name, about in load.presets().items())
     groups["common"].add_argument(
         "--preset", default="default", metavar="WORD", help=f"settings laid over the task's own ({presets})"
@@ -48,10 +54,10 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 class _Help(argparse.Action):
-    """--help, which reads the settings of the task and the flags before it when it is reached."""
+    """--help, or --help all, which reads the settings of the task and the flags before it when it is reached."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(nargs=0, **options)
+        super().__init__(nargs="?", metavar="all", **options)
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
@@ -66,8 +72,20 @@ class _Help(argparse.Action):
         for action in parser._actions:
             if action.dest.startswith(_PREFIX):
                 action.help = _help(fields[action.dest.removeprefix(_PREFIX)], config)
+        if values != EVERYTHING:
+            _hide_most(parser)
         parser.print_help()
         parser.exit()
+
+
+def _hide_most(parser: argparse.ArgumentParser) -> None:
+    """Leaves the settings of `_FIRST` in the help, and of the groups those that then have any."""
+    for action in parser._actions:
+        if action.dest.startswith(_PREFIX) and action.dest.removeprefix(_PREFIX) not in _FIRST:
+            action.help = argparse.SUPPRESS
+    shown = [group for group in parser._action_groups if any(x.help != argparse.SUPPRESS for x in group._group_actions)]
+    parser._action_groups = shown
+    parser.epilog = f"{sum(x.help == argparse.SUPPRESS for x in parser._actions)} more settings: --help {EVERYTHING}"
 
 
 def describe(field: dataclasses.Field[Any], config: Config) -> tuple[str, str]:

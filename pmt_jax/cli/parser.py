@@ -16,6 +16,7 @@ from ..tasks import did_you_mean
 RUN = "a run folder, or a pretrained policy: hub:ant_2x4/r4sg (pmt hub lists them)"
 SOURCE = "a task's name (pmt envs lists them), a TOML file, or a Python file with a task of your own: my_env.py"
 HELP = ("-h", "--help")
+EVERYTHING = "all"  # after --help
 
 
 class Parser(argparse.ArgumentParser):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 import subprocess
 import sys
 
 from pmt_jax.cli import commands, policies
 from pmt_jax.config.fields import GROUPS
+from pmt_jax.config.settings import Config
 
 
 def test_help_and_lists_need_no_jax():
@@ -21,13 +24,32 @@ def test_help_and_lists_need_no_jax():
 
 def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    code, out, _ = cli("train", "--help")
+    code, out, _ = cli("train", "--help", "all")
     assert code == 0
     at = [out.index(f"\n{group}:\n") for group in GROUPS]
     assert at == sorted(at) and out.index("--method") < out.index("--num-envs") < out.index("--lambda-lr")
     words = " ".join(out.split())
     assert "how far costs of twice the limit in every update" in words
     assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
+
+
+def test_help_shows_what_most_people_set_and_where_the_rest_is(cli):
+    """Twelve settings and no heading above nothing; all of them with `all`, before a task or after it."""
+    named = {"method", "steps", "seeds", "seed", "num-envs", "rollout-length", "hidden", "actor-lr"}
+    named |= {"cost-limit", "cost-margin", "physics", "env"}
+    every = {field.name.replace("_", "-") for field in dataclasses.fields(Config)} - {"task"}
+    for words, shown in (
+        (("--help",), named),
+        (("lane", "-h"), named),
+        (("--help", "all"), every),
+        (("--help", "all", "lane"), every),
+        (("lane", "--seed", 1, "--help", "all"), every),
+    ):
+        code, out, err = cli("train", *words)
+        assert code == 0 and not err
+        assert set(re.findall(r"^  --([a-z0-9-]+)", out, re.MULTILINE)) & every == shown
+        assert ("more settings: --help all" in out) == (shown == named)
+        assert not re.search(r"^\S.*:\n(  \w.*\n)?\n?(?=^\S)", out.partition("options:")[2], re.MULTILINE)
 
 
 def test_help_after_a_task_shows_its_own_defaults(cli):
