@@ -152,7 +152,7 @@ class Learner:
         self.returns.update(target)
         self._fit_critics(obs.flatten(0, 1), self.returns.scaled(value), self.returns.scaled(target), decay)
         lowest, gain = LAMBDA_MIN * config.lambda_init, config.lambda_lr / config.num_updates
-        self.multiplier = (self.multiplier * (gain * excess).exp()).clamp(lowest, config.lambda_max)
+        self.multiplier = (self.multiplier * (1 + gain * excess)).clamp(lowest, config.lambda_max)
         self.seen.update(batch.obs)
 
     def _excess(self, batch: Batch) -> Tensor:

@@ -237,16 +237,16 @@ def relative_update(
     lambda_min: jax.Array | float,
     lambda_max: jax.Array | float,
 ) -> jax.Array:
-    """One step in proportion to the multiplier: lambda <- clip(lambda exp(alpha x), lambda_min, lambda_max).
+    """One step in proportion to the multiplier: lambda <- clip(lambda (1 + alpha x), lambda_min, lambda_max).
 
-    An exponentiated gradient (Kivinen and Warmuth, 1997). A multiplier doubles in the same time whatever its size, so
+    Multiplicative weights (Arora et al., 2012). A multiplier doubles in the same time whatever its size, so
     one rate serves limits whose multipliers differ by a factor of ten. Without the lower bound a long time without
     costs would take as long to undo, and in the end 0 would never move again.
 
     Args:
       multiplier: [...], lambda > 0; excess: [...], measured and expected, x = S + I, in units of the limit, `cut`.
     """
-    return jnp.clip(multiplier * jnp.exp(lambda_lr * excess), lambda_min, lambda_max)
+    return jnp.clip(multiplier * (1 + lambda_lr * excess), lambda_min, lambda_max)
 
 
 def metrics(setup: Setup, constraint: Constraint, price: jax.Array, excess: jax.Array) -> Metrics:

