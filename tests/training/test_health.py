@@ -187,8 +187,8 @@ def test_debug_adds_nothing_where_it_is_off():
 @pytest.mark.full
 def test_debug_computes_the_same_run(whole, tmp_path, cli):
     out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--steps", 400, "--debug", "--out", out)[0] == 0
-    assert rows(out) == [{**row, "seconds": mine["seconds"]} for row, mine in zip(rows(whole), rows(out), strict=False)]
+    assert cli("train", *ARGUMENTS, "--steps", STEPS, "--debug", "--out", out)[0] == 0
+    assert rows(out) == [{**row, "seconds": mine["seconds"]} for row, mine in zip(rows(whole), rows(out), strict=True)]
 
 
 UNSOUND = """

@@ -6,6 +6,7 @@ import csv
 import io
 import pathlib
 import re
+import signal
 import sys
 import threading
 import types
@@ -13,17 +14,20 @@ import types
 import pytest
 from rich.console import Console
 
-from pmt_jax.training import metrics, progress
+from pmt_jax.training import loggers, metrics, progress
 from pmt_jax.training.progress import COLUMNS, Progress
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 
 @pytest.mark.full
-def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
+def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     pytest.importorskip("tensorboardX")
     out = tmp_path / "run"
     arguments = ("train", *ARGUMENTS, "--out", out, "--loggers", "csv,tensorboard")
-    assert cli(*arguments, "--steps", 400)[0] == 0
+    write = loggers.Jsonl.write
+    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(15)))
+    assert cli(*arguments, "--steps", STEPS)[0] == 128 + 15
+    monkeypatch.undo()
     assert cli(*arguments, "--steps", STEPS, "--resume", "--profile", tmp_path / "trace")[0] == 0
     with (out / "metrics.csv").open(newline="") as file:
         table = list(csv.DictReader(file))

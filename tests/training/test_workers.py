@@ -19,9 +19,12 @@ from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, saved
 WORKERS = ("train", *ARGUMENTS, "--workers", 2)
 
 
+STILL = ("--lambda-lr", 0)  # so that a run does not depend on how long it is to be
+
+
 def begun(out: pathlib.Path, *more: object) -> subprocess.Popen[str]:
     """A run in two workers that has written its first rows and has long to go."""
-    words = [str(word) for word in (*WORKERS, "--steps", 10**7, "--out", out, *more)]
+    words = [str(word) for word in (*WORKERS, "--steps", 10**7, *STILL, "--out", out, *more)]
     command = [sys.executable, "-m", "pmt_jax", *words]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout and any(line.startswith("steps ") for line in process.stdout)
@@ -60,8 +63,8 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
     assert (process.returncode, err) == (128 + signal.SIGTERM, "")  # together: an abort says why on stderr
     assert f"--out {tmp_path / 'run'} --resume --workers 2" in text.splitlines()[-1]
     goal = rows(tmp_path / "run")[-1]["step"] + STEPS // 4
-    assert cli(*WORKERS, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
-    assert cli(*WORKERS, "--steps", goal, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert cli(*WORKERS, *STILL, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
+    assert cli(*WORKERS, *STILL, "--steps", goal, "--out", tmp_path / "uninterrupted")[0] == 0
     assert_same_run(tmp_path / "run", tmp_path / "uninterrupted")
 
 
@@ -76,8 +79,8 @@ def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: path
     assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --workers 2")
     assert not (tmp_path / "run").exists()
     step = rows(saved)[-1]["step"]
-    assert cli(*WORKERS, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
-    assert cli(*WORKERS, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert cli(*WORKERS, *STILL, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
+    assert cli(*WORKERS, *STILL, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
     assert_same_run(saved, tmp_path / "uninterrupted")
 
 
@@ -93,7 +96,7 @@ def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathli
     assert f"saved as of step {step:,}. Continue with: pmt train" in said
     psutil.wait_procs([first], timeout=60)
     assert not first.is_running()
-    assert cli(*WORKERS, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
+    assert cli(*WORKERS, *STILL, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
 
 
 @pytest.mark.full
