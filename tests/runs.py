@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import os
 import pathlib
+import signal
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
+import pytest
 
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import LearnerState
 from pmt_jax.output import Say
-from pmt_jax.training import checkpoint
+from pmt_jax.training import checkpoint, loggers
 from pmt_jax.training.compile import Programs, compile_run, evaluate_seeds
 
 STEPS = 1600
@@ -38,6 +40,12 @@ def assert_same_run(out: pathlib.Path, other: pathlib.Path) -> None:
     first, second = saved(out), saved(other)
     assert first.keys() == second.keys()
     assert all(np.array_equal(first[path], second[path]) for path in first)
+
+
+def stop_after_rows(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Runs of this process get the signal as soon as they have written rows."""
+    write = loggers.Jsonl.write
+    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(number)))
 
 
 def environment() -> dict[str, str]:

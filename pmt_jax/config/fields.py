@@ -39,7 +39,6 @@ SHARE = Bound("lie in [0, 1]", lambda x: 0 <= x <= 1)
 POSITIVE = Bound("be a number above 0", lambda x: 0 < x <= FLOAT32_MAX)
 NOT_NEGATIVE = Bound("be a number that is not negative and fits 32 bits", lambda x: 0 <= x <= FLOAT32_MAX)
 POSITIVE_OR_INF = Bound("be a number above 0, or inf", lambda x: x > 0)
-STEPS_OR_INF = Bound("be a number of steps above 0, or inf", lambda x: x > 0)
 NOT_NEGATIVE_OR_INF = Bound("be a number that is not negative, or inf", lambda x: x >= 0)
 
 

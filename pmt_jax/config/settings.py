@@ -265,10 +265,9 @@ def _validate_sizes(config: Config) -> None:
         )
     if config.num_updates > INT32_MAX:
         raise UsageError(f"steps = {config.steps} is more than 2**31 updates of {config.batch_size} steps")
-    sequences = [(config.num_envs, f"the sequences of {config.num_envs} environments")]
-    for count, what in [
-        (config.batch_size, f"a batch of {config.batch_size} steps"),
-        *(sequences if config.recurrent != "none" else ()),
-    ]:
+    parts = {f"a batch of {config.batch_size} steps": config.batch_size}
+    if config.recurrent != "none":
+        parts[f"the sequences of {config.num_envs} environments"] = config.num_envs
+    for what, count in parts.items():
         if count % config.minibatches:
             raise UsageError(f"{what} cannot be cut into {config.minibatches} equal minibatches; take a divisor")

@@ -192,9 +192,9 @@ def respond(
     if setup.method.letter:
         step = excess + hyper.surrogate_weight * setup.config.rollout_length * surrogate
         updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
-        return dataclasses.replace(constraint, multiplier=updated)
-    step, lowest = cut(excess + hyper.surrogate_weight * surrogate), LAMBDA_MIN * hyper.lambda_init
-    updated = relative_update(constraint.multiplier, step, gain(setup, hyper), lowest, hyper.lambda_max)
+    else:
+        step, lowest = cut(excess + hyper.surrogate_weight * surrogate), LAMBDA_MIN * hyper.lambda_init
+        updated = relative_update(constraint.multiplier, step, gain(setup, hyper), lowest, hyper.lambda_max)
     return dataclasses.replace(constraint, multiplier=updated)
 
 

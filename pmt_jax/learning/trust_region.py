@@ -43,10 +43,7 @@ def trust_region_step(
       the network; [] in units of the limit, the most that the step promised to take off the cost; metrics.
     """
     start, unravel = ravel_pytree(net.params)
-    spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
-    worst = jnp.argmax(violation / spread)
-    violation = violation[worst]
-    samples = dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst])
+    samples, c = _most_violated(samples, violation)
     samples, nets = sharding.shard(samples), setup.nets.plain  # the Fisher matrix takes second derivatives
 
     def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -68,8 +65,6 @@ def trust_region_step(
     one, zero = jnp.ones_like(loss0), jnp.zeros_like(loss0)
     (g,), (b,) = pull((one, zero)), pull((zero, one))
     _, fisher = jax.linearize(jax.grad(divergence), start)
-    # What the steps before this one are expected to have changed counts towards the limit.
-    c = violation + cost0 - jnp.mean(samples.factor * jnp.exp(samples.log_weight) * samples.cost_advantage)
     uncoupled, _ = ravel_pytree(setup.nets.is_std(unravel(start)))
     direction = constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, now.kl_limit, uncoupled)
 
@@ -84,18 +79,22 @@ def trust_region_step(
     flat, tried = backtrack(accept, start, direction.step)
     loss, _ = objectives(flat)
     _, std = policy(flat)
-    return (
-        TrainState(unravel(flat), net.opt_state),
-        direction.reach,
-        {
-            "loss": loss,
-            "entropy": distributions.entropy(std, samples.mask).mean(),
-            "std": (std * samples.mask).sum() / samples.mask.sum(),
-            "case": direction.case.astype(loss.dtype),
-            "reach": direction.reach,
-            "line_search_steps": tried.astype(loss.dtype),
-        },
-    )
+    metrics = {
+        "loss": loss,
+        "entropy": distributions.entropy(std, samples.mask).mean(),
+        "std": (std * samples.mask).sum() / samples.mask.sum(),
+        "case": direction.case.astype(loss.dtype),
+        "reach": direction.reach,
+        "line_search_steps": tried.astype(loss.dtype),
+    }
+    return TrainState(unravel(flat), net.opt_state), direction.reach, metrics
+
+
+def _most_violated(samples: PolicySamples, violation: jax.Array) -> tuple[PolicySamples, jax.Array]:
+    """The samples with the one cost that is most beyond its limit, and by how much [] it is."""
+    spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
+    worst = jnp.argmax(violation / spread)
+    return dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst]), violation[worst]
 
 
 @pytree

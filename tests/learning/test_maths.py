@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -119,14 +118,6 @@ def test_value_loss_takes_the_worse_of_the_two():
 
 def test_initial_deviation():
     np.testing.assert_allclose(distributions.std(jnp.asarray(1.0)), 0.365529, rtol=1e-5)
-
-
-def test_scaled_std():
-    parameter = jnp.asarray([1.0, -3.0, 5.0, -20.0])
-    for factor in (0.5, 0.999, 1e-3):
-        scaled = distributions.std(distributions.scaled(parameter, factor))
-        np.testing.assert_allclose(scaled, factor * distributions.std(parameter), rtol=2e-6)
-    chex.assert_trees_all_equal(distributions.scaled(parameter, 1.0), parameter)
 
 
 @pytest.mark.parametrize(

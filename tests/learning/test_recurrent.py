@@ -25,9 +25,8 @@ from pmt_jax.learning.types import Batch, LearnerState, Tag
 from pmt_jax.policies import hub, load, numpy_policy, onnx_policy
 from pmt_jax.policies.export import weights
 from pmt_jax.render import episode
-from pmt_jax.training import loggers
 from recall import LIMIT, OPTIMUM, WITHOUT_MEMORY, Recall
-from runs import assert_same_run, rows, saved
+from runs import assert_same_run, rows, saved, stop_after_rows
 from small import SMALL
 
 GRU = {**SMALL, "recurrent": "gru", "rollout_length": 20, "steps": 8 * 20 * 2, "minibatches": 2}
@@ -202,8 +201,7 @@ def test_only_a_policy_that_remembers_comes_near_the_optimum():
 
 def test_resumed_within_an_episode_bit_for_bit(trained: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     out = tmp_path / "run"
-    write = loggers.Jsonl.write
-    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(15)))
+    stop_after_rows(monkeypatch, signal.SIGTERM)
     assert cli("train", *ARGUMENTS, "--steps", 640, "--out", out)[0] == 128 + 15
     monkeypatch.undo()
     memory = {path: x for path, x in saved(out).items() if path.startswith("['last'].rollout.memory")}

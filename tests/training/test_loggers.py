@@ -14,9 +14,9 @@ import types
 import pytest
 from rich.console import Console
 
-from pmt_jax.training import loggers, metrics, progress
+from pmt_jax.training import metrics, progress
 from pmt_jax.training.progress import COLUMNS, Progress
-from runs import ARGUMENTS, STEPS, assert_same_run, rows
+from runs import ARGUMENTS, STEPS, assert_same_run, rows, stop_after_rows
 
 
 @pytest.mark.full
@@ -24,8 +24,7 @@ def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathli
     pytest.importorskip("tensorboardX")
     out = tmp_path / "run"
     arguments = ("train", *ARGUMENTS, "--out", out, "--loggers", "csv,tensorboard")
-    write = loggers.Jsonl.write
-    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(15)))
+    stop_after_rows(monkeypatch, signal.SIGTERM)
     assert cli(*arguments, "--steps", STEPS)[0] == 128 + 15
     monkeypatch.undo()
     assert cli(*arguments, "--steps", STEPS, "--resume", "--profile", tmp_path / "trace")[0] == 0

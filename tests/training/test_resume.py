@@ -21,7 +21,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
 from pmt_jax.studies import run_log
 from pmt_jax.training import checkpoint, loggers, run_folder, trainer
-from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows
+from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, stop_after_rows
 
 DIES = """
 import os, signal, sys
@@ -65,8 +65,7 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
 def test_a_signal_saves_and_the_command_continues(
     number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
 ):
-    write = loggers.Jsonl.write
-    monkeypatch.setattr(loggers.Jsonl, "write", lambda self, rows: (write(self, rows), signal.raise_signal(number)))
+    stop_after_rows(monkeypatch, number)
     out = tmp_path / "a b"
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
     assert code == 128 + number and not (out / ".lock").exists()

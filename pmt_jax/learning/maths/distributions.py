@@ -14,12 +14,6 @@ def std(parameter: jax.Array) -> jax.Array:
     return STD_MAX * jax.nn.sigmoid(parameter)
 
 
-def scaled(parameter: jax.Array, factor: jax.Array | float) -> jax.Array:
-    """The parameter of `factor` times its standard deviation, factor in (0, 1]; itself, bit for bit, if factor is 1."""
-    log_share = jnp.log(factor) + jax.nn.log_sigmoid(parameter)
-    return jnp.where(factor < 1, log_share - jnp.log1p(-jnp.exp(log_share)), parameter)
-
-
 def log_prob(action: jax.Array, mean: jax.Array, std: jax.Array, mask: jax.Array) -> jax.Array:
     """Log-density of `action` [..., A] in nats, summed over unmasked entries: [...]."""
     z = (action - mean) / std

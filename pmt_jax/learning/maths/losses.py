@@ -57,7 +57,7 @@ def clipped_penalty(
 
     Args:
       log_ratio, log_weight, factor: [...], see `clipped_surrogate`; clip: eps.
-      cost_advantage: [..., K], centred; excess: [K], S in cost per step; both in one unit, like a standard deviation.
+      cost_advantage: [..., K], centred; excess: [K], S; both in one unit, like a standard deviation.
     """
     ratio = jnp.exp(log_ratio + log_weight)[..., None]
     each = jnp.maximum(ratio * cost_advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * cost_advantage)
