@@ -247,7 +247,7 @@ BENCHES = {
     ),
     "update_gpu": Bench(
         "GPU: one gradient step of a network: seconds and kernels by part",
-        (*_fits("ant_2x4", 2048, 8, "xla"), *_fits("ant_2x4", 384, 32, "xla")),
+        (*_fits("ant_2x4", 2048, 8, "xla", "fused"), *_fits("ant_2x4", 384, 32, "xla", "fused")),
         _fits("lane", 16, 16, "xla"),
         on="gpu",
     ),

@@ -1,4 +1,4 @@
-"""Where the time of one gradient step of a network goes, part by part, by XLA and by the learner's C++ code."""
+"""Where the time of one gradient step of a network goes, part by part, by XLA and by the learner's compiled code."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def update(case: Case) -> Record:
     network, way = case.what.split()
     if (way == "fused") != fused.available():
         if way == "fused":
-            raise RuntimeError("there is no C++ code of networks here")
+            raise RuntimeError("there is no compiled code of networks here")
         with _without_code():
             return _row(case, network)
     return _row(case, network)
@@ -98,7 +98,7 @@ def _loops(setup: Setup, network: str) -> dict[str, Any]:
     def loop(last: str) -> Any:
         return jax.lax.scan(functools.partial(step, last), start, order.reshape(config.epochs * config.minibatches, -1))
 
-    parts = ["gather", "forward", "backward", *(["adam"] if fused.available() else ["norm", "adam"])]
+    parts = ["gather", "forward", "backward", *(["adam"] if fused.available() and fused.on_cpu() else ["norm", "adam"])]
     whole = functools.partial(
         fit, start, loss, samples, key, epochs=config.epochs, minibatches=config.minibatches, **limits
     )

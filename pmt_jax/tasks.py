@@ -175,6 +175,11 @@ def native() -> types.ModuleType:
     return importlib.import_module(f"{_envs().__name__}.native")
 
 
+def gpu() -> types.ModuleType:
+    """How CUDA code is compiled and called here."""
+    return importlib.import_module(f"{_envs().__name__}.physics.fused.gpu")
+
+
 def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:
     """Prints a line before something that takes long while a task is made inside."""
     return importlib.import_module(f"{_envs().__name__}.progress").announcing(say)

@@ -27,8 +27,9 @@ from envs.physics.fused.model import tables
 from envs.velocity import robots
 from paths import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
-from pmt_jax.learning import learner
+from pmt_jax.learning import fused, learner
 from pmt_jax.learning.evaluation import play
+from pmt_jax.learning.networks import MLP
 from pmt_jax.training.run_folder import MATMUL_PRECISION
 from stepping import crowded
 from threads_on_cpu import compiled, runner
@@ -350,3 +351,70 @@ def test_training_repeats_bit_for_bit():
 
 def as_numbers(leaf):
     return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+
+
+# -- the networks --
+
+
+SHAPES = [  # hidden, outputs, activation, layer norm, input norm, inputs, rows: widths of whole tiles and of parts
+    ((128, 128), 1, "relu", True, False, 29, 2048),
+    ((128, 128), 4, "tanh", True, True, 31, 100),
+    ((64,), 2, "elu", True, False, 7, 1000),
+    ((256, 256, 256), 20, "relu", False, True, 400, 5000),
+    ((40, 24), 3, "tanh", False, False, 5, 17),
+    ((500,), 30, "relu", True, False, 600, 4097),
+    ((), 3, "relu", True, False, 10, 300),
+]
+
+
+@pytest.fixture
+def float32_products():
+    """Products by XLA in float32, as in training."""
+    with jax.default_matmul_precision(MATMUL_PRECISION):
+        yield
+
+
+def network_of(hidden, outputs, activation, layer_norm, input_norm, inputs):
+    """A network whose weights are neither 0 nor 1."""
+    module = MLP(hidden, outputs, 1.0, activation, layer_norm, input_norm)
+    params = module.init(jax.random.key(0), jnp.zeros(inputs))
+    return module, jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(x.size), x.shape), params)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: "-".join(map(str, (shape[5], *shape[0], shape[1]))))
+def test_a_networks_kernels_compute_what_xla_computes(shape, float32_products):
+    *about, rows = shape
+    module, params = network_of(*about)
+    x, target = (jax.random.normal(jax.random.key(k), (rows, width)) for k, width in ((1, about[-1]), (2, about[1])))
+
+    def loss(apply, params):
+        out = apply(params, x)
+        return jnp.mean((out - target) ** 2), out
+
+    def both(apply):
+        return jax.jit(jax.value_and_grad(functools.partial(loss, apply), has_aux=True))
+
+    ((_, out), gradient), ((_, expected), exactly) = (
+        both(apply)(params) for apply in (functools.partial(fused.apply, module), module.apply)
+    )
+    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+    largest = max(np.abs(z).max() for z in jax.tree.leaves(exactly))
+    for found, right in zip(jax.tree.leaves(gradient), jax.tree.leaves(exactly), strict=True):
+        np.testing.assert_allclose(found, right, rtol=0, atol=5e-5 * largest)
+    stacked = jax.tree.map(lambda x: jnp.stack([1.1 * x, x]), params)
+    beside = jax.jit(jax.vmap(functools.partial(fused.apply, module), (0, None)))(stacked, jnp.asarray(x))[1]
+    assert same(beside, jax.jit(functools.partial(fused.apply, module))(params, jnp.asarray(x)))
+
+
+@pytest.mark.parametrize("method", ["mappo_l", "macpo", "mixed", "mappo", "ippo_l"])
+def test_an_update_learns_what_xla_learns(method, monkeypatch, float32_products):
+    config = load_config("lane", method=method, num_envs=32, rollout_length=16, steps=1024, log_interval=1)
+    assert fused.available()
+    found = jax.jit(lambda key: learner.make_train(config)(key))(jax.random.key(0))
+    monkeypatch.setattr(fused, "available", lambda: False)
+    expected = jax.jit(lambda key: learner.make_train(config)(key))(jax.random.key(0))
+    assert found[1].keys() == expected[1].keys()
+    for net in ("critic", "cost_critic", "actor"):
+        pairs = zip(*(jax.tree.leaves(getattr(state, net)) for state, _ in (found, expected)), strict=True)
+        for x, y in pairs:
+            np.testing.assert_allclose(x, y, rtol=0, atol=2e-3 * max(1.0, float(np.abs(y).max())))

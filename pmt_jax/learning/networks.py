@@ -123,7 +123,7 @@ class Networks:
       own_critics: critics see an agent's own observation [O], not the state [S]; all agents share one.
       own_fear: each agent has a fear network of its own with heads [K], weights with a leading [N].
       gates: of recurrent actors and critics, the layers up to their memory, the same for all; None if none remembers.
-      fused: whether C++ code computes them where it can (see `fused`).
+      fused: whether compiled code computes them where it can (see `fused`).
     """
 
     num_actors: int
@@ -154,6 +154,10 @@ class Networks:
     @property
     def _compiled(self) -> bool:
         return self.fused and fused.available()
+
+    @property
+    def _unrolls(self) -> bool:
+        return self._compiled and fused.on_cpu()
 
     def init_actor(self, key: jax.Array) -> Params:
         """Weights with a leading [num_actors]."""
@@ -251,7 +255,7 @@ class Networks:
     def advance(self, params: Params, x: jax.Array, hidden: jax.Array) -> jax.Array:
         """What a recurrent network remembers after one more step: x [..., I], hidden [..., H] -> [..., H]."""
         gates = self._gates(params, x)
-        if not self._compiled:
+        if not self._unrolls:
             return gru.cell(gates, hidden, *_recurrence(params))
         steps, before = gates.reshape(-1, 1, gates.shape[-1]), hidden.reshape(-1, hidden.shape[-1])
         never = jnp.zeros(steps.shape[:2], bool)
@@ -259,7 +263,7 @@ class Networks:
 
     def remember(self, params: Params, seen: Sequences) -> jax.Array:
         """What a recurrent network remembers after each step, before any reset: [B, T, ..., H]."""
-        unroll = fused.unroll if self._compiled else gru.unroll
+        unroll = fused.unroll if self._unrolls else gru.unroll
         return unroll(self._gates(params, seen.x), seen.hidden, seen.done, *_recurrence(params))
 
     def of_all(self, params: Params) -> Params:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from . import fused, sharding
 from .types import Metrics, Params, TrainState
@@ -49,6 +50,30 @@ def descend(
     return TrainState(params, opt_state), norm
 
 
+def _as_vector(net: TrainState, loss: Loss) -> tuple[TrainState, Loss, Callable[[TrainState], TrainState]]:
+    """A network whose layers' weights are one vector, as are Adam's moments; its loss; what makes a tree of it again.
+
+    The standard deviation stays apart: XLA would sum its gradient over the rows anew for every number of the vector.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(net.params)
+    is_std = [path[-1].key == "std" for path, _ in leaves]
+    _, unravel = ravel_pytree([leaf for (_, leaf), std in zip(leaves, is_std, strict=True) if not std])
+
+    def vector_of(tree: Params) -> Params:
+        each = list(zip(jax.tree.leaves(tree), is_std, strict=True))
+        return ravel_pytree([leaf for leaf, std in each if not std])[0], [leaf for leaf, std in each if std]
+
+    def tree_of(params: Params) -> Params:
+        weights, stds = iter(unravel(params[0])), iter(params[1])
+        return jax.tree.unflatten(structure, [next(stds if std else weights) for std in is_std])
+
+    def mapped(net: TrainState, change: Callable[[Params], Params]) -> TrainState:
+        mu, nu = change(net.opt_state.mu), change(net.opt_state.nu)
+        return TrainState(change(net.params), net.opt_state._replace(mu=mu, nu=nu))
+
+    return mapped(net, vector_of), lambda params, rows: loss(tree_of(params), rows), lambda net: mapped(net, tree_of)
+
+
 def fit(
     net: TrainState,
     loss: Loss,
@@ -72,6 +97,7 @@ def fit(
       The trained network, and the loss (`loss`) with its metrics, means over the last epoch.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
+    net, loss, tree_of = _as_vector(net, loss) if fused.steps_vectors() else (net, loss, lambda net: net)
     shuffle = jax.vmap(lambda k: shuffled(k, count))(jax.random.split(key, epochs))
 
     def step(net: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
@@ -82,4 +108,5 @@ def fit(
         return net, {"loss": value, "grad_norm": norm, **metrics}
 
     net, metrics = jax.lax.scan(step, net, shuffle.reshape(epochs * minibatches, -1))
+    net = tree_of(net)
     return net, jax.tree.map(lambda x: x[-minibatches:].mean(0), metrics)

@@ -161,6 +161,16 @@ def test_a_fit_ends_where_xlas_ends(by_xla, bound):
     assert jax.tree.structure(jax.jit(run)()) == jax.tree.structure(expected)
 
 
+def test_weights_as_one_vector_end_where_a_tree_of_them_ends(by_xla, monkeypatch):
+    module, params = network(7, (33, 16), 2, "elu")
+    run = functools.partial(fitted, module, params, rows_of(), jax.random.key(3))
+    expected = by_xla(jax.jit(run))
+    monkeypatch.setattr(fused, "steps_vectors", lambda: True)  # as on a GPU
+    found = by_xla(jax.jit(lambda: run()))
+    assert_close(found, expected, 1e-6)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+
+
 def test_networks_fitted_side_by_side_have_the_bits_of_each_alone():
     seeds = range(3)
     module, _ = network(7, (40, 24), 2)
@@ -193,6 +203,28 @@ def test_an_update_learns_what_xla_learns(by_xla, task, method):
     state, metrics = train(jax.random.key(0))
     assert_close(learned(state), learned(expected[0]), 2e-3)
     assert metrics.keys() == expected[1].keys()
+
+
+CUDA = ["mlp_forward", "mlp_backward", "mlp_gradients", "mlp_sum"]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("method", "recurrent", "nets"), [("mixed", "none", 5), ("mappo_l", "gru", 3), ("macpo", "none", 2)]
+)
+def test_an_update_is_lowered_for_a_gpu_with_the_networks_kernels(method, recurrent, nets, monkeypatch):
+    """Without a GPU: its calls are traced, batched, differentiated and lowered, but not compiled."""
+    kernels = tasks.gpu()
+    monkeypatch.setattr(kernels, "ptx", lambda *_: "ptx")
+    monkeypatch.setattr(kernels, "knows_call", lambda: True)
+    monkeypatch.setattr(fused.gpu, "available", lambda: True)
+    monkeypatch.setattr(fused, "on_cpu", lambda: False)
+    sizes = {"num_envs": 16, "rollout_length": 32, "steps": 512, "log_interval": 1}
+    train = jax.vmap(learner.make_train(load_config("lane", method=method, recurrent=recurrent, **sizes)))
+    traced = jax.jit(train).trace(jax.random.split(jax.random.key(0), 2))
+    program = traced.lower(lowering_platforms=("cuda",)).as_text()
+    forward, *backward = (program.count(f'name = "{name}"') for name in CUDA)
+    assert backward == [nets] * 3 and forward > nets
 
 
 def test_without_a_compiler_the_learner_is_xlas_and_one_sentence_says_so(monkeypatch):

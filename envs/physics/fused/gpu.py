@@ -1,4 +1,4 @@
-"""The step on NVIDIA GPUs: one launch a control step, called by XLA.
+"""Kernels on NVIDIA GPUs as functions of arrays, and the step of a model: one launch a control step.
 
 XLA launches PTX that a program carries, under a name of its own. Where an XLA does not know that name, `launch` does
 it from the host; the bits are the same.
@@ -30,15 +30,47 @@ _ENTRY = "fused_step"
 
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """Compiled code that one block of 32 threads runs for each row of the batch.
+    """Compiled code that blocks of threads run for each item of a batch; called with arrays [..., *item], all of one
+    batch, it returns float32 results [..., *item]. vmap, however nested, makes the batch larger.
 
     Attributes:
-      entry: its name in the PTX. ptx: the code. widths: numbers in a row of each result.
+      entry: its name in the PTX. ptx: the code. results: shapes of an item of each result.
+      rank: axes of an item of the first array. blocks, threads: for an item, and of a block.
+      way: `xla` or `host`; whichever this XLA has if None.
+      crowded: what computes the same of batches of more than so many blocks.
     """
 
     entry: str
     ptx: str
-    widths: tuple[int, ...]
+    results: tuple[tuple[int, ...], ...]
+    rank: int = 1
+    blocks: int = 1
+    threads: int = threads.LANES
+    way: Way | None = None
+    crowded: tuple[int, Kernel] | None = None
+
+    def __call__(self, *arrays: jax.Array) -> Any:
+        chosen = self.way or ("xla" if knows_call() else "host")
+        return _call.bind(*arrays, kernel=self) if chosen == "xla" else launch.call(self, *arrays)
+
+    def batch(self, array: Any) -> tuple[int, ...]:
+        """The batch's axes, from the first array."""
+        return array.shape[: len(array.shape) - self.rank]
+
+    def of(self, items: int) -> Kernel:
+        """The kernel for so many items."""
+        return self.crowded[1] if self.crowded and items * self.blocks > self.crowded[0] else self
+
+
+def obstacle() -> str | None:
+    """Why no kernel runs here, as the rest of a sentence; None if they do."""
+    kind = jax.devices()[0].device_kind
+    return nvrtc.obstacle() if "nvidia" in kind.lower() else f"runs on NVIDIA GPUs; found {kind}"
+
+
+def ptx(source: str, headers: dict[str, str], what: str) -> str:
+    """PTX for the local GPUs; see `nvrtc.ptx`."""
+    return nvrtc.ptx(source, headers, architecture(), what)
 
 
 def make_step(tables: Tables, way: Way | None = None) -> Step:
@@ -56,9 +88,9 @@ def make_step(tables: Tables, way: Way | None = None) -> Step:
     """
     readings = list(tables.readings.values())
     widths = [tables.nq, tables.nv, tables.nv, 1, *(len(r.rows) * FIELDS[r.field] for r in readings)]
-    kernel = Kernel(_ENTRY, nvrtc.step_ptx(threads.source(tables), architecture()), tuple(widths))
-    chosen = way or ("xla" if knows_call() else "host")
-    run = functools.partial(_call.bind, kernel=kernel) if chosen == "xla" else launch.make_call(kernel)
+    run = Kernel(
+        _ENTRY, nvrtc.step_ptx(threads.source(tables), architecture()), tuple((width,) for width in widths), way=way
+    )
 
     def step(*state_and_ctrl: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
         qpos, qvel, warmstart, overflow, *read = run(*state_and_ctrl)
@@ -79,7 +111,7 @@ def architecture() -> str:
 def knows_call() -> bool:
     """Whether this XLA launches PTX by itself: a kernel that does nothing tells."""
     empty = f".version 8.0\n.target sm_75\n.address_size 64\n.visible .entry {_ENTRY}(.param .u64 a, .param .u64 b)\n"
-    kernel = Kernel(_ENTRY, empty + "{\nret;\n}\n", (1,))
+    kernel = Kernel(_ENTRY, empty + "{\nret;\n}\n", ((1,),))
     try:
         jax.jit(functools.partial(_call.bind, kernel=kernel)).lower(jnp.zeros((1, 1), jnp.float32)).compile()
     except jax.errors.JaxRuntimeError:
@@ -89,14 +121,14 @@ def knows_call() -> bool:
 
 # -- XLA's own call --
 
-_call = Primitive("fused_step")
+_call = Primitive("gpu_kernel")
 _call.multiple_results = True
 
 
 @_call.def_abstract_eval
 def _results(*arrays: Any, kernel: Kernel) -> list[Any]:
-    lead = arrays[0].shape[:-1]
-    return [arrays[0].update(shape=(*lead, width), dtype=jnp.dtype(jnp.float32)) for width in kernel.widths]
+    lead = kernel.batch(arrays[0])
+    return [arrays[0].update(shape=(*lead, *item), dtype=jnp.dtype(jnp.float32)) for item in kernel.results]
 
 
 @_call.def_impl
@@ -110,14 +142,15 @@ def _batched(arrays: Sequence[Any], axes: Sequence[Any], *, kernel: Kernel) -> t
         jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
-    return _call.bind(*spread, kernel=kernel), [0] * len(kernel.widths)
+    return _call.bind(*spread, kernel=kernel), [0] * len(kernel.results)
 
 
 batching.primitive_batchers[_call] = _batched
 
 
 def _lower(context: Any, *operands: Any, kernel: Kernel) -> Any:
-    rows = math.prod(context.avals_in[0].shape[:-1])
+    items = math.prod(kernel.batch(context.avals_in[0]))
+    kernel = kernel.of(items)
 
     def number(value: int) -> Any:
         return ir.IntegerAttr.get(ir.IntegerType.get_signless(32), value)
@@ -127,10 +160,10 @@ def _lower(context: Any, *operands: Any, kernel: Kernel) -> Any:
         "name": ir.StringAttr.get(kernel.entry),
         "kernel_type": ir.StringAttr.get("ptx"),
         "kernel_data": ir.StringAttr.get(kernel.ptx),
-        "grid_x": number(rows),
-        "block_x": number(threads.LANES),
+        "grid_x": number(items * kernel.blocks),
+        "block_x": number(kernel.threads),
         "shared_mem_bytes": number(0),
-        "output_indices": ir.ArrayAttr.get([number(len(operands) + k) for k in range(len(kernel.widths))]),
+        "output_indices": ir.ArrayAttr.get([number(len(operands) + k) for k in range(len(kernel.results))]),
     }
     return jax.ffi.ffi_lowering(CALL, backend_config=config, api_version=4)(context, *operands)
 

@@ -6,39 +6,32 @@ import ctypes
 import functools
 import math
 import threading
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
 
 from ..host_call import Frame, register_handler, stream_of
-from . import threads
 
 if TYPE_CHECKING:
     from .gpu import Kernel
 
 
-def make_call(kernel: Kernel) -> Callable[..., Any]:
-    """A function of arrays [..., D] that launches the kernel with a block a row; batch axes come from vmap."""
-    name = _registered(kernel)
-
-    def call(*arrays: jax.Array) -> Any:
-        lead = arrays[0].shape[:-1]
-        results = [jax.ShapeDtypeStruct((*lead, width), arrays[0].dtype) for width in kernel.widths]
-        return jax.ffi.ffi_call(name, results, vmap_method="broadcast_all")(*arrays)
-
-    return call
+def call(kernel: Kernel, *arrays: jax.Array) -> Any:
+    """The kernel's results of arrays; batch axes come from vmap."""
+    lead = kernel.batch(arrays[0])
+    results = [jax.ShapeDtypeStruct((*lead, *item), arrays[0].dtype) for item in kernel.results]
+    return jax.ffi.ffi_call(_registered(kernel), results, vmap_method="broadcast_all")(*arrays)
 
 
 @functools.cache
 def _registered(kernel: Kernel) -> str:
-    loaded = _Loaded(kernel)
+    loaded = {each: _Loaded(each) for each in (kernel, *(kernel.crowded or ())[1:])}
 
     def handle(frame: Frame) -> None:
         buffers = [*frame.operands.buffers(), *frame.results.buffers()]
-        rows = math.prod(buffers[0].shape[:-1])
-        if rows:
-            loaded.launch(stream_of(frame), rows, [buffer.data for buffer in buffers])
+        items = math.prod(kernel.batch(buffers[0]))
+        if items:
+            loaded[kernel.of(items)].launch(stream_of(frame), items, [buffer.data for buffer in buffers])
 
     return register_handler(handle, platform="CUDA")
 
@@ -50,14 +43,14 @@ class _Loaded:
         self._kernel, self._functions = kernel, {}
         self._loading = threading.Lock()
 
-    def launch(self, stream: int, rows: int, addresses: list[int]) -> None:
+    def launch(self, stream: int, items: int, addresses: list[int]) -> None:
         driver, context = _driver(), ctypes.c_void_p()
         _check("cuStreamGetCtx", driver.cuStreamGetCtx(ctypes.c_void_p(stream), ctypes.byref(context)))
         _check("cuCtxPushCurrent", driver.cuCtxPushCurrent_v2(context))
         try:
             values = [ctypes.c_void_p(address) for address in addresses]
             arguments = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-            sizes = (rows, 1, 1, threads.LANES, 1, 1, 0)
+            sizes = (items * self._kernel.blocks, 1, 1, self._kernel.threads, 1, 1, 0)
             function = self._function(context.value)
             _check("cuLaunchKernel", driver.cuLaunchKernel(function, *sizes, ctypes.c_void_p(stream), arguments, None))
         finally:

@@ -1,4 +1,4 @@
-"""PTX of the step, by the run-time compiler that `jax[cuda13]` installs: no toolkit, and no compiler at the user's.
+"""PTX, by the run-time compiler that `jax[cuda13]` installs: no toolkit, and no compiler at the user's.
 
 The text is kept in the user's cache, under a hash of all that it is made of.
 """
@@ -39,16 +39,29 @@ def step_ptx(tables: str, architecture: str) -> str:
     """
     headers = {name: (_FOLDER / name).read_text() for name in _SOURCES} | {"tables.h": tables}
     source = f'#define REAL float\n#define MODEL "tables.h"\n#define BLOCKS {_WORLDS}\n#include "kernel.cu"\n'
+    return ptx(source, headers, architecture, "the step")
+
+
+def ptx(source: str, headers: Mapping[str, str], architecture: str, what: str) -> str:
+    """PTX of a source that includes headers, {name: text}, compiled once.
+
+    Args:
+      architecture: of the device, `9.0`.
+      what: it is, for a message.
+
+    Raises:
+      TaskError: no NVRTC, or it refuses the source.
+    """
     options = (f"--gpu-architecture=compute_{architecture.replace('.', '')}", *_OPTIONS)
     made_of = [*_version(), source, *options, *(part for item in headers.items() for part in item)]
     key = hashlib.sha256("\0".join(map(str, made_of)).encode()).hexdigest()[:32]
-    kept = cache_of_user() / "fused" / f"step-{key}.ptx"
+    kept = cache_of_user() / "fused" / f"{key}.ptx"
     with contextlib.suppress(OSError, UnicodeDecodeError):
         return kept.read_text()
-    ptx = compiled(source, headers, options)
+    text = compiled(source, headers, options, what)
     with contextlib.suppress(OSError):  # a home that cannot be written: the next process compiles again
-        _put(kept, ptx)
-    return ptx
+        _put(kept, text)
+    return text
 
 
 def _put(path: pathlib.Path, text: str) -> None:
@@ -105,7 +118,7 @@ def _version() -> tuple[int, int]:
     return major.value, minor.value
 
 
-def compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...]) -> str:
+def compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...], what: str) -> str:
     """PTX of a source that includes headers, {name: text}.
 
     Raises:
@@ -113,7 +126,7 @@ def compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...]) 
     """
     nvrtc, program = library(), ctypes.c_void_p()
     names, texts = (list_of(part) for part in (headers.keys(), headers.values()))
-    created = nvrtc.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"step.cu", len(headers), texts, names)
+    created = nvrtc.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"source.cu", len(headers), texts, names)
     if created:
         raise TaskError(f"NVIDIA's run-time compiler does not start (error {created})")
     try:
@@ -121,7 +134,7 @@ def compiled(source: str, headers: Mapping[str, str], options: tuple[str, ...]) 
         if failed:
             log = _text(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
             first = next((line for line in log.splitlines() if "error" in line), log[:200])
-            raise TaskError(f"NVIDIA's run-time compiler {'.'.join(map(str, _version()))} refuses the step: {first}")
+            raise TaskError(f"NVIDIA's run-time compiler {'.'.join(map(str, _version()))} refuses {what}: {first}")
         return for_older_drivers(_text(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program))
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))

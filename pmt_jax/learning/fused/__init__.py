@@ -1,4 +1,6 @@
-"""Networks in training by C++ code, on CPUs with a compiler: what XLA computes, to rounding, in half the time.
+"""Networks in training by compiled code: what XLA computes, to rounding, in half the time.
+
+On NVIDIA GPUs it is CUDA (gpu.py); what follows is for CPUs with a C++ compiler.
 
 XLA's products of small matrices and its many passes over the rows between them cost more than the arithmetic. Here a
 network's forward pass, its backward pass and Adam's step are a call each (mlp.cpp), over the threads of XLA's pool. So
@@ -23,6 +25,7 @@ import numpy as np
 from ... import tasks
 from .. import sharding
 from ..types import Params
+from . import gpu
 
 if TYPE_CHECKING:
     from ..networks import MLP
@@ -76,8 +79,15 @@ def _wide(width: int) -> int:
 
 
 def available() -> bool:
-    """Whether what is traced now can call the code: on one CPU device, where it compiles."""
-    return jax.default_backend() == "cpu" and sharding.single_device() and function_names() is not None
+    """Whether what is traced now can call the code: on one CPU device, where it compiles, or on one NVIDIA GPU."""
+    if not sharding.single_device():
+        return False
+    return gpu.available() or on_cpu()
+
+
+def on_cpu() -> bool:
+    """Whether there is code for this CPU, also of recurrent units and of Adam."""
+    return jax.default_backend() == "cpu" and function_names() is not None
 
 
 @functools.cache
@@ -107,8 +117,10 @@ def _call(which: int, results: Sequence[Any], **options: Any) -> Callable[..., A
 def apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
     """As `module.apply`: x [..., I] to [..., O]. Only the weights have a gradient, and no second one."""
     layers, last = params["params"], len(module.hidden)
-    if last >= MOST_LAYERS:
+    if last >= MOST_LAYERS or (gpu.available() and not gpu.takes(module, x.shape[-1])):
         return module.apply(params, x)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
+    if gpu.available():
+        return gpu.apply(module, params, x)
     norms = [layers[f"LayerNorm_{i}"] for i in range(sum(name.startswith("LayerNorm") for name in layers))]
     first = [norms.pop(0)] if module.input_norm else []
     weights = [norm[name] for norm in first for name in ("scale", "bias")]
@@ -195,10 +207,15 @@ _sequences.defvjp(_sequences_forward, _sequences_backward)
 # -- Adam --
 
 
+def steps_vectors() -> bool:
+    """Whether a network's weights are best one vector while it is fitted: Adam is then one kernel of a GPU."""
+    return available() and gpu.available()
+
+
 def takes(params: Params) -> bool:
     """Whether `adam` can step these weights."""
     leaves = jax.tree.leaves(params)
-    return len(leaves) <= MOST_LEAVES and all(x.dtype == _F32 and x.size for x in leaves)
+    return on_cpu() and len(leaves) <= MOST_LEAVES and all(x.dtype == _F32 and x.size for x in leaves)
 
 
 def adam(
