@@ -167,16 +167,19 @@ def unroll(gates: jax.Array, hidden: jax.Array, done: jax.Array, kernel: jax.Arr
 
 @jax.custom_vjp
 def _sequences(gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    return _sequences_forward(gates, hidden, going, kernel, bias)[0]
+    return _states(0, gates, hidden, going, kernel, bias)[0]
+
+
+def _states(saved: int, gates: jax.Array, hidden: jax.Array, *others: jax.Array) -> list[jax.Array]:
+    width, rows = hidden.shape[-1], gates.shape[:2]
+    sizes = ((*rows, width), (*rows, saved), (3 * width * _wide(width),))
+    return _call(3, [jax.ShapeDtypeStruct(size, _F32) for size in sizes])(gates, hidden, *others)
 
 
 def _sequences_forward(
     gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array
 ) -> tuple[jax.Array, Any]:
-    width, rows = hidden.shape[-1], gates.shape[:2]
-    sizes = ((*rows, width), (*rows, 4 * width), (3 * width * _wide(width),))
-    results = [jax.ShapeDtypeStruct(size, _F32) for size in sizes]
-    states, saved, _ = _call(3, results)(gates, hidden, going, kernel, bias)
+    states, saved, _ = _states(4 * hidden.shape[-1], gates, hidden, going, kernel, bias)
     return states, (states, saved, hidden, going, kernel)
 
 

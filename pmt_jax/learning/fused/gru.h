@@ -72,7 +72,7 @@ inline void forward(const Call& call, long n, long first, long rows, float* bloc
     for (long r = 0; r < rows; ++r) {
       const long at = (n * call.sequences + first + r) * call.steps + t;
       const float *gates = call.gates + at * 3 * h, *bias = call.bias + n * h;
-      float* saved = call.new_saved + at * 4 * h;
+      float* saved = call.new_saved ? call.new_saved + at * 4 * h : nullptr;
       for (long j = 0; j < h; j += LANES) {
         const long k = r * stride + j, count = h - j;
         const Num reset = sigmoid(part(gates + j, count) + load(inner + k));
@@ -80,8 +80,10 @@ inline void forward(const Call& call, long n, long first, long rows, float* bloc
         const Num own = load(inner + 2 * size + k) + part(bias + j, count);
         const Num fresh = hyperbolic_tangent(part(gates + 2 * h + j, count) + reset * own);
         const Num after = (Num(1) - update) * fresh + update * load(state + k);
-        put(saved + j, reset, count), put(saved + h + j, update, count);
-        put(saved + 2 * h + j, fresh, count), put(saved + 3 * h + j, own, count);
+        if (call.new_saved) {
+          put(saved + j, reset, count), put(saved + h + j, update, count);
+          put(saved + 2 * h + j, fresh, count), put(saved + 3 * h + j, own, count);
+        }
         put(call.new_states + at * h + j, after, count);
         store(state + k, call.going[at] != 0 ? after : Num(0));
       }

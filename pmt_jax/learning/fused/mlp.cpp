@@ -244,7 +244,7 @@ EXPORTED XLA_FFI_Error* adam_step(XLA_FFI_CallFrame* frame) {
 }
 
 // gates [..., B, T, 3H], hidden [..., B, H], going [..., B, T], kernel [..., H, 3H] and bias [..., H] to states
-// [..., B, T, H], what a backward pass needs [..., B, T, 4H], and memory for the packed kernel.
+// [..., B, T, H], what a backward pass needs [..., B, T, 4H] or nothing [..., 0], and memory for the packed kernel.
 EXPORTED XLA_FFI_Error* gru_forward(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   gru::Call call = {};
@@ -253,12 +253,13 @@ EXPORTED XLA_FFI_Error* gru_forward(XLA_FFI_CallFrame* frame) {
   }
   call.gates = floats(operand(frame, 0)), call.hidden = floats(operand(frame, 1)), call.going = floats(operand(frame, 2));
   call.kernel = floats(operand(frame, 3)), call.bias = floats(operand(frame, 4));
-  call.new_states = (float*)result(frame, 0)->data, call.new_saved = (float*)result(frame, 1)->data;
+  const long kept = native::size_of_array(result(frame, 1));
+  call.new_states = (float*)result(frame, 0)->data, call.new_saved = kept ? (float*)result(frame, 1)->data : nullptr;
   call.packed = (float*)result(frame, 2)->data;
   const long rows = call.networks * call.sequences, h = call.width;
   if (!has(operand(frame, 1), rows * h) || !has(operand(frame, 2), rows * call.steps) || !call.gates ||
       !has(operand(frame, 3), call.networks * 3 * h * h) || !has(operand(frame, 4), call.networks * h) ||
-      !has(result(frame, 0), rows * call.steps * h) || !has(result(frame, 1), rows * call.steps * 4 * h) ||
+      !has(result(frame, 0), rows * call.steps * h) || !has(result(frame, 1), kept ? rows * call.steps * 4 * h : 0) ||
       !has(result(frame, 2), call.networks * call.packed_size())) {
     return native::failure(frame->api, "gru_forward: wrong shapes or types");
   }
