@@ -106,7 +106,7 @@ def _call(which: int, results: Sequence[Any], **options: Any) -> Callable[..., A
 
 
 def apply(module: MLP, params: Params, x: jax.Array, through: bool = False) -> jax.Array:
-    """As `module.apply`: x [..., I] to [..., O]. The weights have a gradient, and x if `through`; none has a second one."""
+    """As `module.apply`: x [..., I] to [..., O]. Weights have a gradient, x if `through`, and no second one."""
     layers, last = params["params"], len(module.hidden)
     if last >= MOST_LAYERS:
         return module.apply(params, x)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
