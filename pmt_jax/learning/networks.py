@@ -80,6 +80,16 @@ class Recurrent(nn.Module):
         """H."""
         return self.gates.outputs // 3
 
+    @property
+    def last(self) -> MLP:
+        """From the hidden state to the outputs, as a network of its own."""
+        return MLP((), self.outputs, self.head_gain, input_norm=self.gates.layer_norm, parent=None)
+
+    def weights_of_last(self, params: Params) -> Params:
+        """Those that `last` has, among the weights of the whole."""
+        own = params["params"]
+        return {"params": {"Dense_0": own["head"]} | ({"LayerNorm_0": own["norm"]} if self.gates.layer_norm else {})}
+
     def setup(self) -> None:
         """Its own weights, next to those of `gates`."""
         self.kernel = self.param("kernel", _orthogonal_gates, (self.width, 3 * self.width))
@@ -323,7 +333,9 @@ class Networks:
     def _apply(self, module: MLP | Recurrent, params: Params, x: Seen) -> jax.Array:
         out: Any
         x = Remembered(self.remember(params, x)) if isinstance(x, Sequences) else x
-        if isinstance(x, Remembered):
+        if isinstance(x, Remembered) and isinstance(module, Recurrent) and self._compiled:
+            out = fused.apply(module.last, module.weights_of_last(params), x.states, through=True)
+        elif isinstance(x, Remembered):
             out = module.apply(params, x.states, method="read")
         elif self._compiled and isinstance(module, MLP):
             out = fused.apply(module, params, x)

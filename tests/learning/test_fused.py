@@ -108,6 +108,20 @@ def test_a_recurrent_unit_has_xlas_states_and_gradients(count, agents, width):
     assert_close(along(fused.unroll, *given), expected)
 
 
+@pytest.mark.parametrize("input_norm", [False, True])
+def test_what_a_network_sees_has_xlas_gradient_where_it_is_asked_for(input_norm):
+    module, params = network(13, (), 3, input_norm=input_norm)
+    x = jax.random.normal(jax.random.key(9), (50, 13))
+
+    def of_input(apply):
+        return jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(apply(params, x)))))(x)
+
+    with jax.default_matmul_precision("highest"):
+        expected = of_input(module.apply)
+    assert_close(of_input(functools.partial(fused.apply, module, through=True)), expected)
+    np.testing.assert_array_equal(of_input(functools.partial(fused.apply, module)), 0)
+
+
 def test_recurrent_units_side_by_side_have_the_bits_of_each_alone():
     first = sequences(7, 5, (), 13)
     second = (first[0] + 1, ~first[1], *(x / 2 for x in first[2:]))

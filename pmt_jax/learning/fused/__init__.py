@@ -45,11 +45,12 @@ class _Shape:
     activation: str
     layer_norm: bool
     input_norm: bool
+    through: bool  # whether the input has a gradient, too
 
     @property
     def attributes(self) -> dict[str, np.int64]:
         numbers = {"layers": len(self.widths) - 1, "activation": ACTIVATIONS.index(self.activation)}
-        numbers |= {"layer_norm": int(self.layer_norm), "input_norm": int(self.input_norm)}
+        numbers |= {name: int(getattr(self, name)) for name in ("layer_norm", "input_norm", "through")}
         return {name: np.int64(number) for name, number in numbers.items()}
 
     @property
@@ -68,7 +69,7 @@ class _Shape:
 
     def scratch(self, rows: int) -> int:
         """Numbers that the backward pass needs for itself (`Deltas` in mlp.h)."""
-        chunks, size = -(-rows // _CHUNK), rows * _wide(self.widths[0]) if self.input_norm else 0
+        chunks, size = -(-rows // _CHUNK), rows * _wide(self.widths[0]) if self.input_norm or self.through else 0
         for inputs, outputs in zip(self.widths, self.widths[1:], strict=False):
             size += (rows + chunks) * _wide(outputs) + 2 * chunks * _wide(inputs)
         return size
@@ -114,8 +115,8 @@ def _call(which: int, results: Sequence[Any], **options: Any) -> Callable[..., A
 # -- networks --
 
 
-def apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
-    """As `module.apply`: x [..., I] to [..., O]. Only the weights have a gradient, and no second one."""
+def apply(module: MLP, params: Params, x: jax.Array, through: bool = False) -> jax.Array:
+    """As `module.apply`: x [..., I] to [..., O]. Weights have a gradient, x if `through`, and no second one."""
     layers, last = params["params"], len(module.hidden)
     if last >= MOST_LAYERS or (gpu.available() and not gpu.takes(module, x.shape[-1])):
         return module.apply(params, x)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
@@ -128,8 +129,9 @@ def apply(module: MLP, params: Params, x: jax.Array) -> jax.Array:
         weights += [layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]]
         weights += [norms[i][name] for name in ("scale", "bias")] if module.layer_norm and i < last else []
     widths = (x.shape[-1], *module.hidden, module.outputs)
-    shape = _Shape(widths, module.activation, module.layer_norm, module.input_norm)
-    out: jax.Array = _network(shape, weights, jax.lax.stop_gradient(x).reshape(-1, x.shape[-1]))
+    shape = _Shape(widths, module.activation, module.layer_norm, module.input_norm, through)
+    x = x if through else jax.lax.stop_gradient(x)
+    out: jax.Array = _network(shape, weights, x.reshape(-1, x.shape[-1]))
     return out.reshape(*x.shape[:-1], module.outputs)
 
 
@@ -150,10 +152,10 @@ def _forward(shape: _Shape, weights: list[jax.Array], x: jax.Array) -> tuple[jax
 
 def _backward(shape: _Shape, kept: Any, gradient: jax.Array) -> tuple[list[jax.Array], jax.Array]:
     weights, saved, x = kept
-    results = [jax.ShapeDtypeStruct(w.shape, _F32) for w in weights]
+    results = [jax.ShapeDtypeStruct(w.shape, _F32) for w in (*weights, *([x] if shape.through else []))]
     results.append(jax.ShapeDtypeStruct((shape.scratch(x.shape[0]),), _F32))
     *gradients, _ = _call(1, results)(gradient, saved, *weights, **shape.attributes)
-    return gradients, jnp.zeros_like(x)
+    return gradients[: len(weights)], gradients[-1] if shape.through else jnp.zeros_like(x)
 
 
 _network.defvjp(_forward, _backward)
@@ -177,28 +179,30 @@ def unroll(gates: jax.Array, hidden: jax.Array, done: jax.Array, kernel: jax.Arr
 
 @jax.custom_vjp
 def _sequences(gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    return _sequences_forward(gates, hidden, going, kernel, bias)[0]
+    return _states(0, gates, hidden, going, kernel, bias)[0]
+
+
+def _states(saved: int, gates: jax.Array, hidden: jax.Array, *others: jax.Array) -> list[jax.Array]:
+    width, rows = hidden.shape[-1], gates.shape[:2]
+    sizes = ((*rows, width), (*rows, saved), (3 * width * _wide(width),))
+    return _call(3, [jax.ShapeDtypeStruct(size, _F32) for size in sizes])(gates, hidden, *others)
 
 
 def _sequences_forward(
     gates: jax.Array, hidden: jax.Array, going: jax.Array, kernel: jax.Array, bias: jax.Array
 ) -> tuple[jax.Array, Any]:
-    width, rows = hidden.shape[-1], gates.shape[:2]
-    sizes = ((*rows, width), (*rows, 4 * width), (3 * width * _wide(width),))
-    results = [jax.ShapeDtypeStruct(size, _F32) for size in sizes]
-    states, saved, _ = _call(3, results)(gates, hidden, going, kernel, bias)
+    states, saved, _ = _states(4 * hidden.shape[-1], gates, hidden, going, kernel, bias)
     return states, (states, saved, hidden, going, kernel)
 
 
 def _sequences_backward(kept: Any, gradient: jax.Array) -> tuple[jax.Array, ...]:
     states, _, hidden, going, kernel = kept
     width, rows = hidden.shape[-1], states.shape[:2]
-    sizes = ((*rows, 3 * width), (*rows, width), (3 * width * _wide(width),))
+    scratch = (3 * width + 4 * rows[0] * rows[1]) * _wide(width)
+    sizes = ((*rows, 3 * width), kernel.shape, (width,), (scratch,))
     results = [jax.ShapeDtypeStruct(size, _F32) for size in sizes]
-    gates, own, _ = _call(4, results)(gradient, *kept)
-    before = jnp.concatenate([hidden[:, None], states[:, :-1] * going[:, :-1, None]], 1).reshape(-1, width)
-    inner = jnp.concatenate([gates[..., : 2 * width], own], -1).reshape(-1, 3 * width)
-    return gates, jnp.zeros_like(hidden), jnp.zeros_like(going), before.T @ inner, own.sum((0, 1))
+    gates, kernel, bias, _ = _call(4, results)(gradient, *kept)
+    return gates, jnp.zeros_like(hidden), jnp.zeros_like(going), kernel, bias
 
 
 _sequences.defvjp(_sequences_forward, _sequences_backward)

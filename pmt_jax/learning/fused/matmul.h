@@ -56,6 +56,9 @@ __attribute__((noinline)) void strip(const float* a, long row, long column, cons
   for (; i + ROWS <= rows; i += ROWS) {
     tile<ROWS, VECTORS>(a + i * row, row, column, b, b_stride, c + i * c_stride, c_stride, depth, add);
   }
+  for (; ROWS > 4 && i + 4 <= rows; i += 4) {
+    tile<4, VECTORS>(a + i * row, row, column, b, b_stride, c + i * c_stride, c_stride, depth, add);
+  }
   for (; i + 2 <= rows; i += 2) {
     tile<2, VECTORS>(a + i * row, row, column, b, b_stride, c + i * c_stride, c_stride, depth, add);
   }
@@ -96,6 +99,17 @@ inline void pack(const float* from, long row, long column, long depth, long widt
         to[k * columns + j] = j < real ? from[k * row + (first + j) * column] : 0;
       }
     }
+  }
+}
+
+// Some rows and columns of a' b, summed over all rows of a [rows, ...] and of b [rows, ...]: a block of BLOCK rows at
+// most, in columns of one panel.
+constexpr long BLOCK = 24, DEEP = 64;
+inline void multiply_rows(const float* a, long a_stride, const float* b, long b_stride, long rows, long height,
+                          long columns, float* sum) {
+  for (long r = 0; r < rows; r += DEEP) {
+    strip(columns / LANES, a + r * a_stride, 1, a_stride, b + r * b_stride, b_stride, sum, columns, height,
+          least(DEEP, rows - r), r > 0);
   }
 }
 

@@ -13,7 +13,7 @@ struct Call {
   Shape shape;
   long networks, activation;
   const float *x, *weights[MOST_WEIGHTS], *gradient;
-  float *out, *saved, *scratch, *gradients[MOST_WEIGHTS];
+  float *out, *saved, *scratch, *input_gradient, *gradients[MOST_WEIGHTS];
   long weight_size[MOST_WEIGHTS], saved_size, scratch_size;
 };
 
@@ -129,9 +129,14 @@ void backward_task(void* data, int phase, long index) {
   if (phase == 0) {
     const long first = k * CHUNK, rows = least(CHUNK, shape.rows - first);
     const float* gradient = call.gradient + n * shape.rows * shape.width[shape.layers];
-    if (call.activation == RELU) return backward<RELU>(shape, saved, deltas, gradient, first, rows);
-    if (call.activation == TANH) return backward<TANH>(shape, saved, deltas, gradient, first, rows);
-    return backward<ELU>(shape, saved, deltas, gradient, first, rows);
+    if (call.activation == RELU) backward<RELU>(shape, saved, deltas, gradient, first, rows);
+    else if (call.activation == TANH) backward<TANH>(shape, saved, deltas, gradient, first, rows);
+    else backward<ELU>(shape, saved, deltas, gradient, first, rows);
+    const long in = shape.width[0];
+    for (long r = first; shape.through && r < first + rows; ++r) {
+      memcpy(call.input_gradient + (n * shape.rows + r) * in, deltas.input + r * wide(in), in * sizeof(float));
+    }
+    return;
   }
   long which = shape.input_norm ? 2 : 0;
   for (long l = 0; l < shape.layers; ++l) {
@@ -148,13 +153,13 @@ void backward_task(void* data, int phase, long index) {
 }
 
 // Fills in what all calls have in common; false if the arrays are not a network's. Attributes in the order of their
-// names: activation, input_norm, layer_norm, layers.
+// names: activation, input_norm, layer_norm, layers, through.
 bool read(const XLA_FFI_CallFrame* frame, long first, Call& call) {
   Shape& shape = call.shape;
-  if (frame->attrs.size != 4) return false;
+  if (frame->attrs.size != 5) return false;
   call.activation = native::attribute(frame, 0);
   shape.input_norm = native::attribute(frame, 1), shape.layer_norm = native::attribute(frame, 2);
-  shape.layers = native::attribute(frame, 3);
+  shape.layers = native::attribute(frame, 3), shape.through = native::attribute(frame, 4);
   if (shape.layers < 1 || shape.layers > MOST_LAYERS || frame->args.size != first + shape.weights()) return false;
   for (long k = 0; k < shape.weights(); ++k) {
     call.weights[k] = floats(operand(frame, first + k));
@@ -202,12 +207,12 @@ EXPORTED XLA_FFI_Error* mlp_forward(XLA_FFI_CallFrame* frame) {
   return native::run(frame, forward_task, &call, {call.networks * shape.layers, call.networks * shape.chunks()}, 0);
 }
 
-// The gradient of outputs [..., R, out], what the forward pass saved and the weights to those of the weights, and
-// scratch memory.
+// The gradient of outputs [..., R, out], what the forward pass saved and the weights to those of the weights, that of x
+// if it has one, and scratch memory.
 EXPORTED XLA_FFI_Error* mlp_backward(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   Call call;
-  if (!read(frame, 2, call) || frame->rets.size != call.shape.weights() + 1) {
+  if (!read(frame, 2, call) || frame->rets.size != call.shape.weights() + 1 + call.shape.through) {
     return native::failure(frame->api, "mlp_backward: wrong arguments");
   }
   Shape& shape = call.shape;
@@ -216,12 +221,13 @@ EXPORTED XLA_FFI_Error* mlp_backward(XLA_FFI_CallFrame* frame) {
   Deltas deltas;
   call.saved_size = saved.place(shape, nullptr), call.scratch_size = deltas.place(shape, nullptr);
   call.gradient = floats(operand(frame, 0)), call.saved = (float*)operand(frame, 1)->data;
-  const long last = shape.weights();
-  call.scratch = (float*)result(frame, last)->data;
+  const long count = shape.weights(), last = count + shape.through;
+  call.input_gradient = (float*)result(frame, count)->data, call.scratch = (float*)result(frame, last)->data;
   bool right = has(operand(frame, 0), call.networks * shape.rows * shape.width[shape.layers]) &&
                has(operand(frame, 1), call.networks * call.saved_size) &&
                has(result(frame, last), call.networks * call.scratch_size);
-  for (long k = 0; k < last; ++k) {
+  if (shape.through) right &= has(result(frame, count), call.networks * shape.rows * shape.width[0]);
+  for (long k = 0; k < count; ++k) {
     call.gradients[k] = (float*)result(frame, k)->data;
     right &= has(result(frame, k), call.networks * call.weight_size[k]);
   }
@@ -238,7 +244,7 @@ EXPORTED XLA_FFI_Error* adam_step(XLA_FFI_CallFrame* frame) {
 }
 
 // gates [..., B, T, 3H], hidden [..., B, H], going [..., B, T], kernel [..., H, 3H] and bias [..., H] to states
-// [..., B, T, H], what a backward pass needs [..., B, T, 4H], and memory for the packed kernel.
+// [..., B, T, H], what a backward pass needs [..., B, T, 4H] or nothing [..., 0], and memory for the packed kernel.
 EXPORTED XLA_FFI_Error* gru_forward(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   gru::Call call = {};
@@ -247,37 +253,41 @@ EXPORTED XLA_FFI_Error* gru_forward(XLA_FFI_CallFrame* frame) {
   }
   call.gates = floats(operand(frame, 0)), call.hidden = floats(operand(frame, 1)), call.going = floats(operand(frame, 2));
   call.kernel = floats(operand(frame, 3)), call.bias = floats(operand(frame, 4));
-  call.new_states = (float*)result(frame, 0)->data, call.new_saved = (float*)result(frame, 1)->data;
+  const long kept = native::size_of_array(result(frame, 1));
+  call.new_states = (float*)result(frame, 0)->data, call.new_saved = kept ? (float*)result(frame, 1)->data : nullptr;
   call.packed = (float*)result(frame, 2)->data;
   const long rows = call.networks * call.sequences, h = call.width;
   if (!has(operand(frame, 1), rows * h) || !has(operand(frame, 2), rows * call.steps) || !call.gates ||
       !has(operand(frame, 3), call.networks * 3 * h * h) || !has(operand(frame, 4), call.networks * h) ||
-      !has(result(frame, 0), rows * call.steps * h) || !has(result(frame, 1), rows * call.steps * 4 * h) ||
+      !has(result(frame, 0), rows * call.steps * h) || !has(result(frame, 1), kept ? rows * call.steps * 4 * h : 0) ||
       !has(result(frame, 2), call.networks * call.packed_size())) {
     return native::failure(frame->api, "gru_forward: wrong shapes or types");
   }
   return native::run(frame, gru::task, &call, {call.networks * 3, call.networks * call.tasks()}, 0);
 }
 
-// The gradient of states [..., B, T, H], these, what the forward pass saved, hidden, going and kernel to the gradient of
-// gates [..., B, T, 3H], that of what r multiplies [..., B, T, H], and memory for the packed kernel.
+// The gradient of states [..., B, T, H], these, what the forward pass saved, hidden, going and kernel to the gradients of
+// gates [..., B, T, 3H], of the kernel and of the bias, and scratch memory [..., size].
 EXPORTED XLA_FFI_Error* gru_backward(XLA_FFI_CallFrame* frame) {
   if (native::is_query(frame)) return nullptr;
   gru::Call call = {};
-  if (frame->args.size != 6 || frame->rets.size != 3 || !gru::sizes(result(frame, 0), call)) {
+  if (frame->args.size != 6 || frame->rets.size != 4 || !gru::sizes(result(frame, 0), call)) {
     return native::failure(frame->api, "gru_backward: wrong arguments");
   }
   call.gradient = floats(operand(frame, 0)), call.states = floats(operand(frame, 1));
   call.saved = floats(operand(frame, 2)), call.hidden = floats(operand(frame, 3));
   call.going = floats(operand(frame, 4)), call.kernel = floats(operand(frame, 5));
-  call.gate_gradient = (float*)result(frame, 0)->data, call.inner_gradient = (float*)result(frame, 1)->data;
-  call.packed = (float*)result(frame, 2)->data;
+  call.gate_gradient = (float*)result(frame, 0)->data, call.kernel_gradient = (float*)result(frame, 1)->data;
+  call.bias_gradient = (float*)result(frame, 2)->data;
+  call.packed = (float*)result(frame, 3)->data, call.scratch = call.packed + call.networks * call.packed_size();
   const long rows = call.networks * call.sequences, h = call.width;
   if (!has(operand(frame, 0), rows * call.steps * h) || !has(operand(frame, 1), rows * call.steps * h) ||
       !has(operand(frame, 2), rows * call.steps * 4 * h) || !has(operand(frame, 3), rows * h) ||
       !has(operand(frame, 4), rows * call.steps) || !has(operand(frame, 5), call.networks * 3 * h * h) ||
-      !has(result(frame, 1), rows * call.steps * h) || !has(result(frame, 2), call.networks * call.packed_size())) {
+      !has(result(frame, 1), call.networks * 3 * h * h) || !has(result(frame, 2), call.networks * h) ||
+      !has(result(frame, 3), call.networks * (call.packed_size() + call.scratch_size()))) {
     return native::failure(frame->api, "gru_backward: wrong shapes or types");
   }
-  return native::run(frame, gru::task, &call, {call.networks * 3, call.networks * call.tasks()}, 0);
+  const long gradients = call.networks * (1 + call.gradient_tasks());
+  return native::run(frame, gru::task, &call, {call.networks * 3, call.networks * call.tasks(), gradients}, 0);
 }

@@ -23,9 +23,11 @@ struct Shape {
   long rows, layers;
   long width[MOST_LAYERS + 1];  // of the input, of what each layer gives
   bool layer_norm, input_norm;
+  bool through;   // whether the input has a gradient
   bool gradient;  // whether a backward pass follows
 
   long chunks() const { return (rows + CHUNK - 1) / CHUNK; }
+  bool to_input() const { return input_norm || through; }  // whether the backward pass goes so far
   bool normed(long layer) const { return layer < 0 ? input_norm : layer_norm && layer + 1 < layers; }
   long weights() const { return 2 * layers + 2 * (input_norm + (layer_norm ? layers - 1 : 0)); }
 };
@@ -98,7 +100,7 @@ struct Deltas {
       scale[l] = pieces.take(shape.chunks() * in);
       offset[l] = pieces.take(shape.chunks() * in);
     }
-    input = pieces.take(shape.input_norm ? shape.rows * wide(shape.width[0]) : 0);
+    input = pieces.take(shape.to_input() ? shape.rows * wide(shape.width[0]) : 0);
     return pieces.at - block;
   }
 };

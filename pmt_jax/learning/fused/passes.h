@@ -103,7 +103,7 @@ FUNCTION void normalise_back(const Rows& rows, long first, float* gradient, floa
 // gradient passes the layer.
 inline void pack_layer(const Shape& shape, const Layer& layer, const Norm& before, const Packed& saved, long l) {
   pack(layer.kernel, layer.out, 1, layer.in, layer.out, saved.packed[l]);
-  if (shape.gradient && (l > 0 || shape.input_norm)) {
+  if (shape.gradient && (l > 0 || shape.to_input())) {
     pack(layer.kernel, 1, layer.out, layer.out, layer.in, saved.turned[l]);
   }
   for (long j = 0; j < wide(layer.out); ++j) saved.bias[l][j] = j < layer.out ? layer.bias[j] : 0;
@@ -178,7 +178,7 @@ void backward(const Shape& shape, const Saved& saved, const Deltas& deltas, cons
     const long in = wide(shape.width[l]), out = shape.width[l + 1];
     const float* delta = deltas.delta[l] + first * wide(out);
     add_rows(delta, rows, wide(out), deltas.bias[l] + chunk * wide(out));
-    if (l == 0 && !shape.input_norm) break;
+    if (l == 0 && !shape.to_input()) break;
     float* before = l > 0 ? deltas.delta[l - 1] : deltas.input;
     multiply(delta, wide(out), saved.turned[l], before + first * in, rows, out, in);
     float *scale_sum = deltas.scale[l] + chunk * in, *offset_sum = deltas.offset[l] + chunk * in;
@@ -199,17 +199,13 @@ void backward(const Shape& shape, const Saved& saved, const Deltas& deltas, cons
 
 // Some columns of the gradient of a kernel [in, out], input' delta over all rows, or of its transpose if `turned`:
 // rows from `row` on, in the columns of the panel at `first`.
-constexpr long BLOCK = 24, DEEP = 64;
 inline void kernel_gradient(const Shape& shape, const Saved& saved, const Deltas& deltas, long l, long row, long first,
                             bool turned, float* gradient) {
   const long in = shape.width[l], out = shape.width[l + 1], height = turned ? out : in, width = turned ? in : out;
   const float *tall = turned ? deltas.delta[l] : saved.input[l], *broad = turned ? saved.input[l] : deltas.delta[l];
   const long rows = least(BLOCK, height - row), columns = least(PANEL * LANES, wide(width) - first);
   float sum[BLOCK * PANEL * LANES];
-  for (long r = 0; r < shape.rows; r += DEEP) {
-    strip(columns / LANES, tall + r * wide(height) + row, 1, wide(height), broad + r * wide(width) + first, wide(width),
-          sum, columns, rows, least(DEEP, shape.rows - r), r > 0);
-  }
+  multiply_rows(tall + row, wide(height), broad + first, wide(width), shape.rows, rows, columns, sum);
   const long row_step = turned ? 1 : out, column_step = turned ? out : 1;
   for (long i = 0; i < rows; ++i) {
     for (long j = 0; j < least(columns, width - first); ++j) {
