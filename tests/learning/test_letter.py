@@ -254,6 +254,7 @@ def test_regret_stands_still_where_nothing_costs():
 # Equations 7, 10, 11, 15 to 17: policies and multipliers
 
 
+@pytest.mark.full
 def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     """Two agents by hand: M weighs the reward alone, each epoch has its weight, lambda <- (lambda + alpha (S + I))+."""
     setup, hyper = R4SG.setup, R4SG.hyper(lambda_lr=0.01)
@@ -291,6 +292,7 @@ def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     assert jnp.abs(factor - 1).max() > 1e-3
 
 
+@pytest.mark.full
 def test_the_excess_is_of_the_cost_critics_values():
     made, hyper = F4SG, F4SG.setup.hyper
     start = made.init(hyper, jax.random.key(0))

@@ -83,7 +83,9 @@ def test_a_long_row_does_not_hide_a_run_that_is_lost(tmp_path: pathlib.Path, cli
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("fault", list(faulty.NOT_FINITE))
+@pytest.mark.parametrize(
+    "fault", ["lnan", *(pytest.param(x, marks=pytest.mark.slow) for x in faulty.NOT_FINITE if x != "lnan")]
+)
 def test_steps_that_are_not_finite_are_reported_everywhere(fault: str, tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file, out = faulty.write(tmp_path, fault), tmp_path / "run"

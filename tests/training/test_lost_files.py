@@ -153,7 +153,7 @@ def test_commands_that_read_work_on_what_is_whole(whole: pathlib.Path, harmed: l
         reads_only(folder, whole, report=False)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 @settings(max_examples=15, **(QUIETLY | {"derandomize": False}))
 @given(harms, st.booleans())

@@ -407,6 +407,7 @@ def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.full
 @compiled
 def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_point_2").engine == "fused"
