@@ -247,7 +247,8 @@ def test_gymnasium_keeps_what_its_checker_checks(mode: str):
 @pytest.mark.parametrize(
     "task",
     [
-        *(pytest.param(x, marks=pytest.mark.full) for x in ("noisy", "switch", "ant_2x4", "velocity_hopper_3x1")),
+        pytest.param("ant_2x4", marks=pytest.mark.full),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("noisy", "switch", "velocity_hopper_3x1")),
         pytest.param("voltage_33", marks=pytest.mark.slow),  # whose power flow compiles eight times
     ],
 )

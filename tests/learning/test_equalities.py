@@ -34,7 +34,7 @@ def test_a_penalty_of_weight_zero_makes_p3o_happo():
     assert differ(weights(trained("p3o")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_the_order_is_a_switch_so_that_p3o_without_weight_is_mappo_too(monkeypatch: pytest.MonkeyPatch):
     together = dataclasses.replace(METHODS["p3o"], order="simultaneous", share_actor=True)
     monkeypatch.setitem(METHODS, "p3o_together", together)

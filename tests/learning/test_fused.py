@@ -58,7 +58,7 @@ def assert_close(found, expected, tolerance=2e-5):
 
 
 @pytest.mark.full  # each shape compiles for seconds
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(
     st.integers(1, 40),
     st.lists(st.integers(1, 150), min_size=0, max_size=3),

@@ -74,6 +74,8 @@ def test_jitted_or_not():
 
 OWN = {"plain": lambda: None, "one agent": lambda: envs.make("lane", num_agents=1), "two costs": TwoDangers}
 QUICK = {("mappo", "plain"), ("macpo", "two costs")}
+SIBLINGS = {(method, "plain") for method in ("happo", "ippo", "mappo_pid", "focops")}
+SIBLINGS |= {(method, env) for method in ("mappo_l", "p3o", "crpo") for env in ("one agent", "two costs")}
 # All methods as they are; what numbers of agents and costs change, with each way to hold a limit.
 CHOSEN = [(method, "plain") for method in METHODS]
 CHOSEN += [
@@ -83,7 +85,10 @@ CHOSEN += [
 
 @pytest.mark.parametrize(
     ("method", "env"),
-    [pytest.param(method, env, marks=() if (method, env) in QUICK else pytest.mark.full) for method, env in CHOSEN],
+    [
+        pytest.param(*x, marks=() if x in QUICK else pytest.mark.slow if x in SIBLINGS else pytest.mark.full)
+        for x in CHOSEN
+    ],
 )
 def test_an_update_keeps_types_so_that_one_program_serves_all_chunks(method: str, env: str):
     setup = make_setup(load_config("lane", method=method, **SMALL), OWN[env]())

@@ -82,9 +82,8 @@ def test_a_long_row_does_not_hide_a_run_that_is_lost(tmp_path: pathlib.Path, cli
     assert code == 1 and "of seed 0 up to step 100 had a cost outside [0, 1], the worst 50" in text
 
 
-@pytest.mark.full
 @pytest.mark.parametrize(
-    "fault", ["lnan", *(pytest.param(x, marks=pytest.mark.slow) for x in faulty.NOT_FINITE if x != "lnan")]
+    "fault", [pytest.param(x, marks=pytest.mark.full if x == "lnan" else pytest.mark.slow) for x in faulty.NOT_FINITE]
 )
 def test_steps_that_are_not_finite_are_reported_everywhere(fault: str, tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -221,10 +221,13 @@ THIN_SMALL = (4, 10)  # the default tests of the other schedule have most of the
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(x, marks=() if k in THIN_SMALL else pytest.mark.full) for k, x in enumerate(SMALL)]
+    ("integrator", "kind"),
+    [
+        *(pytest.param("Euler", x, marks=() if k in THIN_SMALL else pytest.mark.full) for k, x in enumerate(SMALL)),
+        *(pytest.param("RK4", x, marks=pytest.mark.slow) for x in SMALL),  # which the robots have
+    ],
 )
-@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.slow)])
-def test_small_models_step_as_in_mujoco(kind, integrator):
+def test_small_models_step_as_in_mujoco(integrator, kind):
     motor = "<motor joint='h' gear='3'/>" if "'h'" in SMALL[kind] else ""
     motors = f"<actuator>{SERVOS if 'servos' in kind else motor}</actuator>"
     floor = "<geom type='plane' size='5 5 1' margin='.01'/>"
