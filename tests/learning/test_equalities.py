@@ -181,6 +181,7 @@ def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without:
     chex.assert_trees_all_equal(weights(trained(method, kappa=0.0)[0]), weights(trained(without)[0]))
 
 
+@pytest.mark.full
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fear, "appraise_fear", lambda *given: (given[3], given[4].cost, {}))
     made = program.__wrapped__("f4sg")

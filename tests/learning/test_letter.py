@@ -358,6 +358,7 @@ def test_a_seed_beside_others_is_the_seed_alone(method: str):
     chex.assert_trees_all_close(among, third([2]), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.full
 def test_a_state_that_was_saved_goes_on_as_if_it_had_not_been():
     step, hyper = F4SG.step, F4SG.setup.hyper
     state = F4SG.init(hyper, jax.random.key(3))

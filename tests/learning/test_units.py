@@ -35,14 +35,21 @@ def _trained(method: str, env: Switch) -> tuple[LearnerState, dict[str, jax.Arra
     return jax.jit(lambda state: learner.train_chunk(setup, setup.hyper, state, 3))(start)
 
 
-FULL = ("mixed", "macpo", "crpo", "ippo_l")  # every way to hold a limit, fear, regret, critics of observations
-MARKS = {"mappo_l": (), **dict.fromkeys(FULL, pytest.mark.full)}
+FULL = (
+    "mappo_l",
+    "mixed",
+    "macpo",
+    "crpo",
+    "ippo_l",
+)  # every way to hold a limit, fear, regret, critics of observations
 
 
 @pytest.mark.parametrize(
     "method",
     [  # but by the letter, whose equations have the unit of costs
-        pytest.param(name, marks=MARKS.get(name, pytest.mark.slow)) for name, row in METHODS.items() if not row.letter
+        pytest.param(name, marks=pytest.mark.full if name in FULL else pytest.mark.slow)
+        for name, row in METHODS.items()
+        if not row.letter
     ],
 )
 def test_costs_and_a_limit_of_an_eighth_change_nothing(method: str):

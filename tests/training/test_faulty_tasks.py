@@ -59,7 +59,8 @@ def test_an_evaluation_counts_them(fault: str, tmp_path: pathlib.Path):
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(x, marks=pytest.mark.full) if x != "lcostbig" else x for x in faulty.OUT_OF_RANGE]
+    "fault",
+    [pytest.param(x, marks=pytest.mark.full if x == "lcostbig" else pytest.mark.slow) for x in faulty.OUT_OF_RANGE],
 )
 def test_costs_out_of_range_stop_the_run(fault: str, tmp_path: pathlib.Path, cli):
     file, out, worst = faulty.write(tmp_path, fault), tmp_path / "run", faulty.OUT_OF_RANGE[fault]

@@ -322,7 +322,7 @@ AGREEMENT = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("name", AGREEMENT)
 def test_mjx_agrees_with_c(both_engines, name):
     def quantity(state):
@@ -336,7 +336,7 @@ def test_mjx_agrees_with_c(both_engines, name):
     assert np.median(error) < median and error.max() < most
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_engines_agree_exactly_on_costs_and_ends(both_engines):
     c, m = both_engines
     np.testing.assert_array_equal(c.cost, m.cost)

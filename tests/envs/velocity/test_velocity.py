@@ -81,9 +81,17 @@ def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
 
 
+ON_FUSED = {
+    "velocity_hopper_3x1": (),
+    "velocity_swimmer_2x1": pytest.mark.full,
+    "velocity_humanoid_9_8": pytest.mark.full,
+}
+
+
 @compiled
-@each()
+@pytest.mark.parametrize("name", [pytest.param(name, marks=ON_FUSED.get(name, pytest.mark.slow)) for name in NAMES])
 def test_reproduces_the_recorded_steps_on_fused(name):
+    """Each robot compiles for seconds. (tests/envs/physics has their states against C.)"""
     check_replay(name, "fused")
 
 
