@@ -43,9 +43,8 @@ ELSEWHERE = {
 
 
 def _steps(found: re.Match[str]) -> str:
-    """As few as a command without --steps has, but more for a run that goes on."""
-    steps = int(float(found[1]))
-    return f"--steps {max(2048, steps // 100) if steps < 1e6 else 2048}"
+    """Few, but more for a run that goes on."""
+    return f"--steps {min(3000, max(2048, int(float(found[1])) // 100))}"
 
 
 SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [

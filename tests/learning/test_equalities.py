@@ -175,7 +175,7 @@ def test_happo_and_mappo_are_the_same_with_one_agent():
 
 
 @pytest.mark.parametrize(
-    ("method", "without"), [("r4sg", "mappo_l"), pytest.param("mixed", "f4sg", marks=pytest.mark.full)]
+    ("method", "without"), [("r4sg", "mappo_l"), pytest.param("mixed", "f4sg", marks=pytest.mark.slow)]
 )
 def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without: str):
     chex.assert_trees_all_equal(weights(trained(method, kappa=0.0)[0]), weights(trained(without)[0]))

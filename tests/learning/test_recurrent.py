@@ -148,8 +148,8 @@ def test_critics_remember_as_step_after_step(method: str):
 @pytest.mark.parametrize(
     "method",
     [
-        *(pytest.param(x, marks=pytest.mark.full) for x in ("mappo", "macpo", "mixed")),
-        *(pytest.param(x, marks=pytest.mark.slow) for x in ("mappo_l", "ippo_l", "p3o", "focops")),
+        *(pytest.param(x, marks=pytest.mark.full) for x in ("macpo", "mixed")),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("mappo_l", "mappo", "ippo_l", "p3o", "focops")),
     ],
 )
 def test_updates_of_recurrent_networks(method: str):

@@ -55,7 +55,7 @@ def worst(actual, expected) -> float:
 
 @pytest.fixture(
     scope="session",
-    # MJX compiles this ant for a minute; -m full has MJX with the hands and with the robots.
+    # MJX compiles this ant for a minute; -m full has MJX with the hands.
     params=[
         "mujoco",
         pytest.param("fused", marks=(compiled, pytest.mark.full)),
