@@ -48,9 +48,9 @@ MOST_MEMORY = 1.5e9  # bytes of a process of the tests, beyond which it forgets 
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With less optimisation C++ compiles in half the time; `-m full` has all of it."""
+    """With less optimisation C++ compiles in half the time; tests/envs/physics/test_fused.py has all of it."""
     compiler = next(filter(shutil.which, ("c++", "g++", "clang++")), None)
-    if compiler and "not full" in config.getoption("markexpr"):
+    if compiler:
         os.environ.setdefault("CXX", f"{compiler} -O1")  # for processes that tests start, too
 
 
@@ -63,6 +63,21 @@ def memory_is_bounded():
         gc.collect()
         with contextlib.suppress(AttributeError):  # of glibc
             ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def tasks_step_in_c(request: pytest.FixtureRequest):
+    """By default tasks take MuJoCo's own engine, for `fused` compiles seconds for each.
+
+    `-m full` and tests of engines have the order that users have.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if "not full" in request.config.getoption("markexpr") and "physics" not in request.path.parts:
+            from envs.physics import contract
+
+            first = ("mujoco", *(name for name in contract._PREFERENCE if name != "mujoco"))
+            patch.setattr(contract, "_PREFERENCE", first)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

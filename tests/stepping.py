@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import copy
 import functools
+from typing import Any
 
 import mujoco
 import numpy as np
+import pytest
 
 from envs.ant import corridor, walls
 from envs.multi_goal import models as goals
@@ -17,7 +19,22 @@ from envs.physics.fused import model as tables_of
 from envs.velocity import robots
 
 ROBOTS = ("corridor", "hopper", "walls", "swimmer", "humanoid", "ant", "half_cheetah", "walker2d")
-THIN = ("hopper", "walls")  # in the default tests; `walls` is the corridor's ant next to solid walls
+FULL = ("hopper", "walls", "humanoid")  # a planar robot, the corridor's ant next to solid walls, the largest robot
+
+
+def by_robot(*default: str) -> list[Any]:
+    """Parameters: of ROBOTS, those for the default tests, those for `-m full`, and the others, which run by hand."""
+    late = [x for x in ROBOTS if x not in default]
+    return [*default, *(pytest.param(x, marks=pytest.mark.full if x in FULL else pytest.mark.slow) for x in late)]
+
+
+def sweep(robot: str) -> list[Any]:
+    """Parameters (robot, kind, full): some states of one robot by default, many of each as `by_robot` says."""
+    marks = {x: pytest.mark.full if x in FULL else pytest.mark.slow for x in ROBOTS}
+    many = [pytest.param(x, kind, True, marks=marks[x]) for x in ROBOTS for kind in kinds(x)]
+    return [*((robot, kind, False) for kind in kinds(robot)), *many]
+
+
 Rows = dict[str, np.ndarray]  # qpos, qvel, warmstart, and the readouts by name
 
 

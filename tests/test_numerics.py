@@ -103,16 +103,31 @@ def test_every_command_that_compiles_says_so(command: tuple[object, ...], tmp_pa
     ("variable", "command", "says"),
     [
         ("JAX_PLATFORMS=bogus", "train lane", "JAX finds no device with JAX_PLATFORMS=bogus: Unable to initialize"),
-        ("JAX_ENABLE_X64=1", "eval hub:ant_2x4/mappo", "with JAX_ENABLE_X64=1 nothing can be trained or evaluated"),
-        ("JAX_DEBUG_NANS=true", "train lane", "--debug stops training at the first number that is not finite"),
+        pytest.param(
+            "JAX_ENABLE_X64=1",
+            "eval hub:ant_2x4/mappo",
+            "with JAX_ENABLE_X64=1 nothing can be trained or evaluated",
+            marks=pytest.mark.full,
+        ),
+        pytest.param(
+            "JAX_DEBUG_NANS=true",
+            "train lane",
+            "--debug stops training at the first number that is not finite",
+            marks=pytest.mark.full,
+        ),
         ("JAX_ENABLE_X64=maybe", "hub", "JAX cannot start: invalid truth value 'maybe'"),
-        ("JAX_NUMPY_DTYPE_PROMOTION=much", "train lane", "JAX cannot start: Invalid value"),
+        pytest.param(
+            "JAX_NUMPY_DTYPE_PROMOTION=much", "train lane", "JAX cannot start: Invalid value", marks=pytest.mark.full
+        ),
         ("XLA_FLAGS=--xla_no_such_flag", "train lane", "Unknown flag in XLA_FLAGS: --xla_no_such_flag; correct"),
-        ("XLA_FLAGS=no_such_file", "envs lane", 'Could not open file "no_such_file"'),
-        (
+        pytest.param(
+            "XLA_FLAGS=no_such_file", "envs lane", 'Could not open file "no_such_file"', marks=pytest.mark.full
+        ),
+        pytest.param(
             "XLA_FLAGS=--xla_backend_optimization_level=x",
             "envs lane",
             "a value does not fit its flag; correct",
+            marks=pytest.mark.full,
         ),
     ],
 )

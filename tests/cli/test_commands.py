@@ -38,9 +38,9 @@ def test_eval_of_a_run(whole: pathlib.Path, cli):
 
 def test_training_says_at_once_what_it_does(tmp_path: pathlib.Path, cli, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    code, out, _ = cli("train", *ARGUMENTS, "--steps", 200, "--out", tmp_path / "x")
+    code, out, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "x")
     assert code == 0 and out.startswith("loading JAX")
-    for word in ("f4sg on lane", "device cpu", "engine xla", "= 100 a seed", "2 updates", "compiled in", "pmt eval"):
+    for word in ("f4sg on lane", "device cpu", "engine xla", "= 100 a seed", "16 updates", "compiled in", "pmt eval"):
         assert word in out
 
 

@@ -83,7 +83,7 @@ def invocations(draw: st.DrawFn) -> list[str]:
 
 
 @settings(
-    max_examples=300, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(argv=invocations())
 def test_a_command_line_runs_or_gets_one_sentence(argv: list[str], capsys: pytest.CaptureFixture[str]):

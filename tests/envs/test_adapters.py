@@ -238,7 +238,7 @@ def check_vector(make):
     env.close()
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+@pytest.mark.parametrize("mode", ["SameStep", pytest.param("NextStep", marks=pytest.mark.full)])
 def test_gymnasium_keeps_what_its_checker_checks(mode: str):
     pytest.importorskip("gymnasium")
     check_vector(lambda: adapters.to_gymnasium(Fragile(), 2, autoreset_mode=mode))
@@ -247,7 +247,8 @@ def test_gymnasium_keeps_what_its_checker_checks(mode: str):
 @pytest.mark.parametrize(
     "task",
     [
-        *(pytest.param(x, marks=pytest.mark.full) for x in ("noisy", "switch", "ant_2x4", "velocity_hopper_3x1")),
+        pytest.param("ant_2x4", marks=pytest.mark.full),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("noisy", "switch", "velocity_hopper_3x1")),
         pytest.param("voltage_33", marks=pytest.mark.slow),  # whose power flow compiles eight times
     ],
 )
@@ -310,7 +311,7 @@ def test_what_adapters_refuse():
     parallel.step(actions)
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+@pytest.mark.parametrize("mode", ["SameStep", pytest.param("NextStep", marks=pytest.mark.full)])
 def test_a_pickled_gymnasium_environment_goes_on_where_it_was(mode: str):
     pytest.importorskip("gymnasium")
     env = adapters.to_gymnasium(Fragile(), 3, autoreset_mode=mode)

@@ -34,7 +34,7 @@ def test_a_penalty_of_weight_zero_makes_p3o_happo():
     assert differ(weights(trained("p3o")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_the_order_is_a_switch_so_that_p3o_without_weight_is_mappo_too(monkeypatch: pytest.MonkeyPatch):
     together = dataclasses.replace(METHODS["p3o"], order="simultaneous", share_actor=True)
     monkeypatch.setitem(METHODS, "p3o_together", together)
@@ -175,12 +175,13 @@ def test_happo_and_mappo_are_the_same_with_one_agent():
 
 
 @pytest.mark.parametrize(
-    ("method", "without"), [("r4sg", "mappo_l"), pytest.param("mixed", "f4sg", marks=pytest.mark.full)]
+    ("method", "without"), [("r4sg", "mappo_l"), pytest.param("mixed", "f4sg", marks=pytest.mark.slow)]
 )
 def test_regret_that_is_cut_to_nothing_makes_no_difference(method: str, without: str):
     chex.assert_trees_all_equal(weights(trained(method, kappa=0.0)[0]), weights(trained(without)[0]))
 
 
+@pytest.mark.full
 def test_fear_that_is_the_cost_itself_makes_f4sg_mappo_l(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fear, "appraise_fear", lambda *given: (given[3], given[4].cost, {}))
     made = program.__wrapped__("f4sg")

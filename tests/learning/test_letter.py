@@ -27,6 +27,7 @@ from small import SMALL, program
 F4SG = program("f4sg_letter", preset="letter", minibatches=1)
 R4SG = program("r4sg_letter", preset="letter", minibatches=1)
 ROWS = ("f4sg_letter", "r4sg_letter")
+LATE = [pytest.param("f4sg_letter", marks=pytest.mark.full), pytest.param("r4sg_letter", marks=pytest.mark.slow)]
 
 
 @functools.cache
@@ -254,6 +255,7 @@ def test_regret_stands_still_where_nothing_costs():
 # Equations 7, 10, 11, 15 to 17: policies and multipliers
 
 
+@pytest.mark.full
 def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     """Two agents by hand: M weighs the reward alone, each epoch has its weight, lambda <- (lambda + alpha (S + I))+."""
     setup, hyper = R4SG.setup, R4SG.hyper(lambda_lr=0.01)
@@ -291,6 +293,7 @@ def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     assert jnp.abs(factor - 1).max() > 1e-3
 
 
+@pytest.mark.full
 def test_the_excess_is_of_the_cost_critics_values():
     made, hyper = F4SG, F4SG.setup.hyper
     start = made.init(hyper, jax.random.key(0))
@@ -341,8 +344,7 @@ def test_both_together_are_a_row_of_your_own(monkeypatch: pytest.MonkeyPatch):
     assert jax.tree.structure(after) == jax.tree.structure(state) and {"fear/loss", "regret/loss"} <= set(metrics)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("method", ROWS)
+@pytest.mark.parametrize("method", LATE)
 def test_a_seed_beside_others_is_the_seed_alone(method: str):
     train = jax.jit(jax.vmap(make_train(load_config("switch", method, "letter", **SMALL))))
 
@@ -356,6 +358,7 @@ def test_a_seed_beside_others_is_the_seed_alone(method: str):
     chex.assert_trees_all_close(among, third([2]), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.full
 def test_a_state_that_was_saved_goes_on_as_if_it_had_not_been():
     step, hyper = F4SG.step, F4SG.setup.hyper
     state = F4SG.init(hyper, jax.random.key(3))
@@ -368,8 +371,7 @@ def test_a_state_that_was_saved_goes_on_as_if_it_had_not_been():
     assert step(hyper, empty)[1]["fear/loss"] != step(hyper, state)[1]["fear/loss"]  # it learns from what was saved
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("method", ROWS)
+@pytest.mark.parametrize("method", LATE)
 def test_a_run_that_continues_is_the_run_in_one_go(method: str, tmp_path, cli):
     words = ["train", "lane", *TINY, "--method", method, "--preset", "letter", "--no-cache", "--seeds", 2]
     assert cli(*words, "--steps", 800, "--out", tmp_path / "whole")[0] == 0

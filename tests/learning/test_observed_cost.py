@@ -42,6 +42,7 @@ def test_shares_that_are_none(change: dict[str, float]):
         load_config("lane", **change)
 
 
+@pytest.mark.full
 def test_the_learner_sees_what_is_observed_and_reports_what_was_true():
     made = program("f4sg")
     start = made.init(made.setup.hyper, jax.random.key(0))

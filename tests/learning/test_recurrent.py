@@ -145,8 +145,13 @@ def test_critics_remember_as_step_after_step(method: str):
 # Learning
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("method", ["mappo_l", "mappo", "ippo_l", "macpo", "mixed", "p3o", "focops"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(pytest.param(x, marks=pytest.mark.full) for x in ("macpo", "mixed")),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("mappo_l", "mappo", "ippo_l", "p3o", "focops")),
+    ],
+)
 def test_updates_of_recurrent_networks(method: str):
     """All recurrent networks learn, also what multiplies their hidden states."""
     setup = make_setup(load_config("switch", method=method, **GRU), Recall())
@@ -172,7 +177,7 @@ def test_a_seed_does_not_depend_on_the_others():
     chex.assert_trees_all_close(learned(alone), second, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_jitted_or_not():
     train = make_train(load_config("lane", **{**GRU, "num_envs": 2, "rollout_length": 3, "steps": 6}))
     jitted, _ = jax.jit(train)(jax.random.key(0))
@@ -185,6 +190,7 @@ def learned(state: LearnerState) -> Any:
     return state.actor.params, state.critic.net.params, state.cost_critic.net.params, state.rollout.memory
 
 
+@pytest.mark.full
 def test_only_a_policy_that_remembers_comes_near_the_optimum():
     """Each of 6 seeds earned 8.00 at no cost under mean actions; while training 7.6 or more after 9,000 steps."""
     config = load_config({"task": "lane"}, method="mappo_l", recurrent="gru", **LEARNS)
@@ -234,6 +240,7 @@ def test_policies_loaded_exported_and_drawn_act_as_the_one_that_was_evaluated(
     assert np.abs(in_numpy(obs[-1])[0] - means[0]).max() > 1e-4  # it does remember
 
 
+@pytest.mark.full
 def test_a_picture_shows_what_the_policy_does(trained: pathlib.Path):
     shown = episode.record_run(trained, seed=1, deterministic=True)
     env, policy, hidden = shown.env, load_policy(trained, seed=1), None
@@ -248,8 +255,8 @@ def test_a_picture_shows_what_the_policy_does(trained: pathlib.Path):
     "changes",
     [
         {"method": "mappo", "activation": "elu"},
-        {"obs_norm": "layernorm", "hidden": [8, 4]},
-        {"obs_norm": "layernorm", "layer_norm": False},
+        pytest.param({"obs_norm": "layernorm", "hidden": [8, 4]}, marks=pytest.mark.full),
+        pytest.param({"obs_norm": "layernorm", "layer_norm": False}, marks=pytest.mark.full),
         {"obs_norm": "none", "hidden": [8, 4, 6]},
     ],
 )
@@ -283,6 +290,7 @@ def test_a_policy_in_the_hub(trained: pathlib.Path, tmp_path: pathlib.Path, monk
         np.testing.assert_allclose(ours, theirs, atol=0.05)
 
 
+@pytest.mark.full
 def test_a_run_starts_from_a_recurrent_one_but_not_from_another(trained: pathlib.Path, tmp_path: pathlib.Path, cli):
     out = tmp_path / "run"
     assert cli("train", *ARGUMENTS, "--steps", 160, "--init", trained, "--out", out)[0] == 0

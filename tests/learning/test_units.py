@@ -35,10 +35,19 @@ def _trained(method: str, env: Switch) -> tuple[LearnerState, dict[str, jax.Arra
     return jax.jit(lambda state: learner.train_chunk(setup, setup.hyper, state, 3))(start)
 
 
+FULL = (
+    "mappo_l",
+    "mixed",
+    "macpo",
+    "crpo",
+    "ippo_l",
+)  # every way to hold a limit, fear, regret, critics of observations
+
+
 @pytest.mark.parametrize(
     "method",
     [  # but by the letter, whose equations have the unit of costs
-        name if name in ("macpo", "mixed") else pytest.param(name, marks=pytest.mark.full)
+        pytest.param(name, marks=pytest.mark.full if name in FULL else pytest.mark.slow)
         for name, row in METHODS.items()
         if not row.letter
     ],

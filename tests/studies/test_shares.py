@@ -67,7 +67,7 @@ def test_a_share_that_died_is_taken_up_by_the_next_call(tmp_path: pathlib.Path, 
     assert code == 0 and "best first" in text and len(finished(out)) == 3
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_shares_at_the_same_time(tmp_path: pathlib.Path):
     out = tmp_path / "out"
     words = [[sys.executable, "-m", "pmt_jax", *map(str, (*SWEEP, out, "--part", f"{i}/3"))] for i in (1, 2, 3)]

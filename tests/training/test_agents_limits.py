@@ -229,6 +229,7 @@ def test_agents_that_share_costs_have_one_column(task: str):
 SCOPES = [("zone", 6, 1), *(pytest.param(*x, marks=pytest.mark.full) for x in (("network", 1, 1), ("regions", 1, 4)))]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("scope", "agents", "costs"), SCOPES)
 def test_zones_of_a_grid_have_a_column_each(scope: str, agents: int, costs: int):
     config = load_config("voltage_33", method="mappo_l", env=[f"cost_scope={scope}"], num_envs=2, hidden=[8])

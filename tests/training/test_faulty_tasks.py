@@ -59,7 +59,8 @@ def test_an_evaluation_counts_them(fault: str, tmp_path: pathlib.Path):
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(x, marks=pytest.mark.full) if x != "lcostbig" else x for x in faulty.OUT_OF_RANGE]
+    "fault",
+    [pytest.param(x, marks=pytest.mark.full if x == "lcostbig" else pytest.mark.slow) for x in faulty.OUT_OF_RANGE],
 )
 def test_costs_out_of_range_stop_the_run(fault: str, tmp_path: pathlib.Path, cli):
     file, out, worst = faulty.write(tmp_path, fault), tmp_path / "run", faulty.OUT_OF_RANGE[fault]
@@ -82,8 +83,9 @@ def test_a_long_row_does_not_hide_a_run_that_is_lost(tmp_path: pathlib.Path, cli
     assert code == 1 and "of seed 0 up to step 100 had a cost outside [0, 1], the worst 50" in text
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("fault", list(faulty.NOT_FINITE))
+@pytest.mark.parametrize(
+    "fault", [pytest.param(x, marks=pytest.mark.full if x == "lnan" else pytest.mark.slow) for x in faulty.NOT_FINITE]
+)
 def test_steps_that_are_not_finite_are_reported_everywhere(fault: str, tmp_path: pathlib.Path, cli, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file, out = faulty.write(tmp_path, fault), tmp_path / "run"

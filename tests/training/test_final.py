@@ -147,10 +147,9 @@ def test_each_agent_and_a_seed_that_broke_count(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_run_says_so_at_its_end(tmp_path: pathlib.Path, cli):
-    """Also one that is run by hand: three lines at most, after the line that says it is done."""
+    """Three lines at most, after the line that says it is done."""
     out = tmp_path / "run"
-    arguments = ("lane", *ARGUMENTS[1:], "--steps", 400)
-    code, text, _ = cli("train", *arguments, "--out", out)
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
     after = text.splitlines()[[line.startswith("done:") for line in text.splitlines()].index(True) + 1 :]
     assert code == 0 and 1 <= len(after) <= 3 and after[0].startswith("limit 1: kept by ")
     assert "under mean actions" in after[0] and after == verdict.lines(out)

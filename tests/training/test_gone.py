@@ -84,10 +84,12 @@ def happens(monkeypatch: pytest.MonkeyPatch):
 
 
 QUICK = ((deleted, 600), (renamed, STEPS), (locked_by_another, 600), (without_rows, 600))
-REST = ((what, step) for what in HOW for step in (600, STEPS) if (what, step) not in QUICK)
+REST = {(what, step): pytest.mark.full if step == 600 else pytest.mark.slow for what in HOW for step in (600, STEPS)}
 
 
-@pytest.mark.parametrize(("what", "step"), [*QUICK, *(pytest.param(*x, marks=pytest.mark.full) for x in REST)])
+@pytest.mark.parametrize(
+    ("what", "step"), [*QUICK, *(pytest.param(*x, marks=mark) for x, mark in REST.items() if x not in QUICK)]
+)
 def test_a_run_whose_folder_is_gone_is_saved_beside_it_and_goes_on_bit_for_bit(
     what: Callable, step: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, happens, monkeypatch
 ):

@@ -18,7 +18,7 @@ from envs.base import Declarations
 from envs.physics import kernels_of
 from pmt_jax import tasks
 from pmt_jax.training import compile
-from runs import ARGUMENTS, environment
+from runs import ARGUMENTS, STEPS, environment
 
 
 def test_kernels_compile_beside_what_is_inside_and_before_it_ends(monkeypatch):
@@ -61,7 +61,7 @@ def test_what_fails_inside_leaves_kernels_uncompiled(monkeypatch):
 def test_only_warp_has_kernels(cli, tmp_path):
     for env in tasks.make("lane"), tasks.make("ant_2x4", "mujoco"):
         assert not tasks.declarations(env).kernels()
-    code, text, _ = cli("train", *ARGUMENTS, "--steps", 200, "--out", tmp_path / "run")
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
     assert code == 0 and " kernels ready" not in text
 
 

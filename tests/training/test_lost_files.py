@@ -133,7 +133,7 @@ def continues(folder: pathlib.Path, whole: pathlib.Path, by_file: bool) -> None:
 QUIETLY = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True, "database": None}
 
 
-@settings(max_examples=12, **QUIETLY)
+@settings(max_examples=8, **QUIETLY)
 @given(harms, st.booleans())
 def test_a_run_continues_from_what_is_whole(whole: pathlib.Path, harmed: list, by_file: bool):
     with tempfile.TemporaryDirectory() as place:
@@ -155,7 +155,7 @@ def test_commands_that_read_work_on_what_is_whole(whole: pathlib.Path, harmed: l
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
-@settings(max_examples=15, **(QUIETLY | {"derandomize": False}))
+@settings(max_examples=5, **(QUIETLY | {"derandomize": False}))
 @given(harms, st.booleans())
 def test_both_on_many_more(whole: pathlib.Path, harmed: list, by_file: bool):
     with tempfile.TemporaryDirectory() as place:

@@ -119,7 +119,10 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(signal.SIGTERM, marks=pytest.mark.full), pytest.param(signal.SIGINT, marks=pytest.mark.slow)],
+)
 def test_an_update_that_takes_too_long_is_given_up_and_what_was_trained_is_saved(
     number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli
 ):

@@ -68,7 +68,7 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
     assert_same_run(tmp_path / "run", tmp_path / "uninterrupted")
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: pathlib.Path, cli):
     process = begun(tmp_path / "run")
     (tmp_path / "run").rename(tmp_path / "elsewhere")

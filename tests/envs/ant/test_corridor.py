@@ -55,8 +55,12 @@ def worst(actual, expected) -> float:
 
 @pytest.fixture(
     scope="session",
-    # MJX compiles this ant for a minute; -m full has MJX with the hands and with the robots.
-    params=["mujoco", pytest.param("fused", marks=compiled), pytest.param("mjx", marks=pytest.mark.slow)],
+    # MJX compiles this ant for a minute; -m full has MJX with the hands.
+    params=[
+        "mujoco",
+        pytest.param("fused", marks=(compiled, pytest.mark.full)),
+        pytest.param("mjx", marks=pytest.mark.slow),
+    ],
 )
 def replay(request):
     """Recording and our State after one control step from each of its rows."""
@@ -358,7 +362,7 @@ def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
 @pytest.mark.parametrize(
     ("engine", "most"),
     [
-        pytest.param("fused", 5e-6, marks=compiled),
+        pytest.param("fused", 5e-6, marks=(compiled, pytest.mark.full)),
         pytest.param("mjx", 1e-4, marks=pytest.mark.slow),  # which compiles for a minute
     ],
 )

@@ -22,14 +22,15 @@ from envs.multi_goal.models import COLOURS
 from envs.multi_goal.multi_goal import KINDS, VASE_HEIGHT
 from envs.multi_goal.scene import HAZARD_COLOUR
 from envs.multi_goal.sensing import SENSORS
-from envs.physics import PhysicsState, resolve
+from envs.physics import PhysicsState
 from native import compiled
 from paths import DATA
 
 NAMES = [f"multi_goal_{variant}" for variant in VARIANTS]
-# By default, both robots, hazards, vases with and without a cost, slots: the points on `fused`, the ants on `mujoco`.
-POINT_2 = ("multi_goal_point_2", resolve("auto"))
+# By default, both robots, hazards, vases with and without a cost, slots, on the engine that compiles nothing.
+POINT_2 = ("multi_goal_point_2", "mujoco")
 DEFAULT = (POINT_2, ("multi_goal_ant_1", "mujoco"))
+FULL = (("multi_goal_point_0", "mujoco"), ("multi_goal_point_2", "fused"), ("multi_goal_ant_2", "fused"))
 # Against MuJoCo 3.17 and against the reference's 2.3.3: largest error of robots' and vases' qpos and qvel, of rewards,
 # and of observations over 1 + |x|.
 NEW, OLD = (2e-5, 5e-4, 2e-5, 5e-4, 1e-4, 1e-3), (2e-5, 5e-4, 1e-4, 1e-2, 1e-4, 2e-3)
@@ -39,8 +40,9 @@ MJX = (5e-5, 5e-3, 1e-4, 1e-2, 2e-4, 5e-2)
 def each(default: tuple[tuple[str, str], ...] = DEFAULT):
     both = [(name, engine) for name in NAMES for engine in ("fused", "mujoco")]
     skips = {"fused": (compiled,), "mujoco": ()}
+    late = {each: pytest.mark.full if each in (*FULL, *DEFAULT) else pytest.mark.slow for each in both}
     marked = [
-        pytest.param(*each, marks=(*skips[each[1]], *(() if each in default else (pytest.mark.full,)))) for each in both
+        pytest.param(*each, marks=(*skips[each[1]], *(() if each in default else (late[each],)))) for each in both
     ]
     return pytest.mark.parametrize(("name", "physics"), marked)
 
@@ -407,6 +409,7 @@ def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.full
 @compiled
 def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_point_2").engine == "fused"

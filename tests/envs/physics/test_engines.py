@@ -294,6 +294,7 @@ def test_interrupt_reaches_python_between_programs():
     assert done.returncode == 0 and "interrupted True" in done.stdout, done.stderr
 
 
+@pytest.mark.full
 def test_interrupt_inside_a_step_never_passes_for_a_result():
     """XLA runs short programs on the main thread, so Ctrl-C lands in our host function."""
     done = run(

@@ -33,7 +33,20 @@ from envs.velocity import robots
 from native import compiled
 from paths import ROOT
 from pmt_jax import tasks
-from stepping import ROBOTS, THIN, answers, anywhere, by_c, check, crowded, exact, kinds, model_of, readout_of, states
+from stepping import (
+    answers,
+    anywhere,
+    by_c,
+    by_robot,
+    check,
+    crowded,
+    exact,
+    kinds,
+    model_of,
+    readout_of,
+    states,
+    sweep,
+)
 
 pytestmark = compiled
 
@@ -56,21 +69,19 @@ def by_fused(model: mujoco.MjModel, rows: np.ndarray, substeps: int, readout: di
 
 # -- numbers --
 
-# The default tests take two robots; all robots and many states take minutes.
-SIZES = [pytest.param(False, id="some"), pytest.param(True, id="all", marks=pytest.mark.full)]
-SWEEP = [(robot, kind, False) for robot in THIN for kind in kinds(robot)]
-SWEEP += [pytest.param(robot, kind, True, marks=pytest.mark.full) for robot in ROBOTS for kind in kinds(robot)]
 
-
-@pytest.mark.parametrize(("robot", "kind", "full"), SWEEP)
-def test_a_control_step_and_its_readouts_are_mujocos(robot, kind, full):
+# By default one robot, for each compiles for seconds; the other schedule has another.
+@pytest.mark.parametrize(("robot", "kind", "full"), sweep("walls"))
+def test_a_control_step_and_its_readouts_are_mujocos(robot, kind, full, monkeypatch):
+    if full:  # as users compile it, with all optimisations
+        monkeypatch.setenv("CXX", os.environ.get("CXX", "").removesuffix(" -O1"))
     model, substeps = model_of(robot)
     ours = by_fused(model, states(robot, kind, full), substeps, readout_of(model))
     check(ours, answers(robot, kind, full), 1e-9, 0.01 if full else 0.05)
     assert not ours["overflow"].any()
 
 
-@pytest.mark.parametrize("robot", [pytest.param(x, marks=pytest.mark.full) for x in ROBOTS])
+@pytest.mark.parametrize("robot", by_robot())
 def test_the_acceleration_is_mujocos(robot):
     """Of the very state: Euler's warm start after one substep. (By default `test_fused_threads` has it.)"""
     model, _ = model_of(robot)
@@ -81,8 +92,7 @@ def test_the_acceleration_is_mujocos(robot):
         check({"warmstart": ours["warmstart"]}, {"warmstart": theirs["warmstart"]}, 1e-8, 0.01)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", by_robot())
 def test_the_float_build_is_mujocos_within_its_rounding(robot):
     """The GPU computes with the same formulae in float."""
     model, substeps = model_of(robot)
@@ -100,9 +110,9 @@ def test_the_float_build_is_mujocos_within_its_rounding(robot):
 @pytest.mark.parametrize(
     ("robot", "vases"),
     [
-        ("point", 2),
-        *(pytest.param("point", count, marks=pytest.mark.full) for count in (0, 1, 4, 10)),
-        *(pytest.param("ant", count, marks=pytest.mark.full) for count in (0, 1, 4)),
+        *(pytest.param("point", count, marks=pytest.mark.slow) for count in (0, 1, 10)),
+        *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 2), ("ant", 4))),
+        *(pytest.param("ant", count, marks=pytest.mark.slow) for count in (0, 1)),
     ],
 )
 def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
@@ -207,14 +217,17 @@ SERVOS = """<position joint='h' kp='2' kv='.1' forcerange='-1 1'/><velocity join
 CONTACTS = dict(zip(list(SMALL)[3:], (2, 2, 1, 1, 2, 2, 2, 1, 14, 5), strict=True))  # of the reference pose
 
 
-THIN_SMALL = (1, 4, 8, 10, 12)  # the default tests of the other schedule have the rest
+THIN_SMALL = (4, 10)  # the default tests of the other schedule have most of the rest
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(x, marks=() if k in THIN_SMALL else pytest.mark.full) for k, x in enumerate(SMALL)]
+    ("integrator", "kind"),
+    [
+        *(pytest.param("Euler", x, marks=() if k in THIN_SMALL else pytest.mark.full) for k, x in enumerate(SMALL)),
+        *(pytest.param("RK4", x, marks=pytest.mark.slow) for x in SMALL),  # which the robots have
+    ],
 )
-@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.full)])
-def test_small_models_step_as_in_mujoco(kind, integrator):
+def test_small_models_step_as_in_mujoco(integrator, kind):
     motor = "<motor joint='h' gear='3'/>" if "'h'" in SMALL[kind] else ""
     motors = f"<actuator>{SERVOS if 'servos' in kind else motor}</actuator>"
     floor = "<geom type='plane' size='5 5 1' margin='.01'/>"
@@ -623,6 +636,7 @@ def started(**environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=ROOT, env=os.environ | environment, **pipes)
 
 
+@pytest.mark.full
 def test_processes_that_compile_at_once_both_step(tmp_path):
     both = [started(XDG_CACHE_HOME=str(tmp_path)) for _ in range(2)]
     answers = [process.communicate(timeout=300) for process in both]

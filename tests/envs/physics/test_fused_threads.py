@@ -14,11 +14,11 @@ from envs.physics.fused import nvrtc, threads
 from envs.physics.fused.model import Tables, obstacle, tables
 from stepping import (
     ROBOTS,
-    THIN,
     Rows,
     answers,
     anywhere,
     by_c,
+    by_robot,
     crowded,
     errors,
     exact,
@@ -26,6 +26,7 @@ from stepping import (
     model_of,
     readout_of,
     states,
+    sweep,
 )
 from threads_on_cpu import compiled, runner, world_bytes
 
@@ -67,19 +68,15 @@ def check(model: mujoco.MjModel, made_of: Tables, rows: np.ndarray, right: tuple
         assert np.quantile(wrong, loose) < tolerance and wrong.max() < 1e-2, name
 
 
-SWEEP = [(robot, kind, False) for robot in ("corridor", *THIN) for kind in kinds(robot)]
-SWEEP += [pytest.param(robot, kind, True, marks=pytest.mark.full) for robot in ROBOTS for kind in kinds(robot)]
-
-
 @compiled
-@pytest.mark.parametrize(("robot", "kind", "full"), SWEEP)
+@pytest.mark.parametrize(("robot", "kind", "full"), sweep("hopper"))
 def test_accelerations_steps_and_readouts_are_mujocos(robot, kind, full):
     right = answers(robot, kind, full, True), answers(robot, kind, full)
     check(*made(robot), states(robot, kind, full), right, 0.97 if kind == "visited" else 0.8)
 
 
 @compiled
-@pytest.mark.parametrize("robot", ["walls", *(pytest.param(x, marks=pytest.mark.full) for x in ROBOTS)])
+@pytest.mark.parametrize("robot", by_robot("hopper"))
 def test_single_precision_is_close(robot):
     model, made_of = made(robot)
     rows = states(robot, kinds(robot)[0]).astype(np.float32).astype(float)
@@ -89,6 +86,7 @@ def test_single_precision_is_close(robot):
     assert np.quantile(errors(found["qvel"], right["qvel"]), 0.95) < 1e-3
 
 
+@pytest.mark.full
 @compiled
 def test_contacts_beyond_the_slots_are_reported():
     """With the floor, and with solid walls; slots of points alone are as many as the points."""
@@ -143,7 +141,9 @@ def test_parallel_and_crossing_capsules_touch_as_in_c(slide, turns, contacts):
 
 
 @compiled
-@pytest.mark.parametrize(("integrator", "density"), [("RK4", 0), ("Euler", 0), ("Euler", 1000)])
+@pytest.mark.parametrize(
+    ("integrator", "density"), [("RK4", 0), *(pytest.param("Euler", x, marks=pytest.mark.full) for x in (0, 1000))]
+)
 def test_trees_that_no_task_has_step_as_in_c(integrator, density):
     """Two trees that touch, bodies of several joints, welded bodies, springs, two motors on a joint, a fluid."""
     model = exact(mujoco.MjModel.from_xml_string(MIXED.format(floor=FLOOR, integrator=integrator, density=density)))
@@ -174,8 +174,11 @@ def random_tree(seed: int) -> str:
     return f"<mujoco><option integrator='RK4'/><worldbody>{FLOOR}{body(0)}</worldbody></mujoco>"
 
 
+SEEDS = {1: (), **dict.fromkeys((0, 2, 3), pytest.mark.full), **dict.fromkeys(range(4, 12), pytest.mark.slow)}
+
+
 @compiled
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.full) for k in range(2, 12))])
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=marks) for seed, marks in SEEDS.items()])
 def test_random_trees_step_as_in_c(seed):
     model = exact(mujoco.MjModel.from_xml_string(random_tree(seed)))
     readout = {"velocity": ("cvel", slice(None))}
@@ -214,7 +217,7 @@ def at_a_box(model: mujoco.MjModel, count: int) -> np.ndarray:
 
 @compiled
 @pytest.mark.parametrize(
-    "size", [".5 .3 .2", *(pytest.param(x, marks=pytest.mark.full) for x in (".1 .1 .1", "300 .5 .7"))]
+    "size", [".5 .3 .2", *(pytest.param(x, marks=pytest.mark.slow) for x in (".1 .1 .1", "300 .5 .7"))]
 )
 def test_capsules_and_spheres_touch_a_box_as_in_c(size):
     model = exact(mujoco.MjModel.from_xml_string(AT_A_BOX.format(size=size)))
@@ -236,7 +239,9 @@ TWO_BOXES = """<mujoco><option timestep='.005'/><worldbody>
 
 
 @compiled
-@pytest.mark.parametrize("size", [".4 .3 .2", pytest.param("2 .05 .1", marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "size", [pytest.param(".4 .3 .2", marks=pytest.mark.full), pytest.param("2 .05 .1", marks=pytest.mark.slow)]
+)
 def test_boxes_touch_boxes_as_in_c(size):
     """Faces, edges and corners; every tenth pair has parallel axes, where the nearest is decided by rounding alone."""
     model = exact(mujoco.MjModel.from_xml_string(TWO_BOXES.format(size=size)))
@@ -253,7 +258,10 @@ def test_boxes_touch_boxes_as_in_c(size):
 @compiled
 @pytest.mark.parametrize(
     ("robot", "vases"),
-    [("point", 2), *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 0), ("point", 4), ("ant", 0)))],
+    [
+        *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 2), ("ant", 0))),
+        *(pytest.param("point", x, marks=pytest.mark.slow) for x in (0, 4)),
+    ],
 )
 def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
     """Two robots among vases: several trees, boxes, all six directions of contacts, and a forward pass at the end."""
@@ -299,7 +307,7 @@ def test_more_bodies_than_lanes_are_refused():
 
 
 @compiled
-@pytest.mark.parametrize("robot", ["walls", *(pytest.param(x, marks=pytest.mark.full) for x in ROBOTS)])
+@pytest.mark.parametrize("robot", by_robot("hopper"))
 def test_the_bytes_of_a_world_are_as_counted(robot):
     counted, right = threads.shared_bytes(made(robot)[1]), world_bytes(made(robot)[1])
     assert right <= counted < 1.08 * right
@@ -315,6 +323,7 @@ def test_more_bytes_than_a_block_has_are_refused():
     assert made_of.nv == 32 and "bytes, and a warp's memory has 49152" in str(threads.obstacle(made_of))
 
 
+@pytest.mark.full
 def test_more_pairs_than_a_world_lists_are_refused():
     balls = "".join(f"<body pos='{k} 0 0'><joint/><geom size='.1'/></body>" for k in range(16))
     boxes = "".join(f"<geom type='box' size='.1 .1 .1' pos='{k} 9 0'/>" for k in range(260))

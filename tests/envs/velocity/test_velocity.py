@@ -81,18 +81,23 @@ def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
 
 
+ON_FUSED = {
+    "velocity_hopper_3x1": (),
+    "velocity_swimmer_2x1": pytest.mark.full,
+    "velocity_humanoid_9_8": pytest.mark.full,
+}
+
+
 @compiled
-@each()
+@pytest.mark.parametrize("name", [pytest.param(name, marks=ON_FUSED.get(name, pytest.mark.slow)) for name in NAMES])
 def test_reproduces_the_recorded_steps_on_fused(name):
+    """Each robot compiles for seconds. (tests/envs/physics has their states against C.)"""
     check_replay(name, "fused")
 
 
-# MJX compiles a robot for up to a minute: the one in a fluid in .ci/run, the others by hand. Contacts on MJX are those
-# of the hands in tests/envs/hands/test_hand_over.py.
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=pytest.mark.full if x == "velocity_swimmer_2x1" else pytest.mark.slow) for x in NAMES],
-)
+# MJX compiles a robot for up to a minute. .ci/run has it with the hands in tests/envs/hands/test_hand_over.py.
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_reproduces_the_recorded_steps_on_mjx(name):
     check_replay(name, "mjx")
 
