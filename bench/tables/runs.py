@@ -44,7 +44,7 @@ OLD |= {"kl_half_life": math.inf, "std_half_life": math.inf, "std_decay_start": 
 OLD |= {"value_norm_decay": 0.995, "limit_windup": 1.0, "lambda_lr": 0.1, "surrogate_weight": 1.0, "lambda_kd": 0.0}
 OLD |= {"fear_l2": 1.0, "regret_l2": 1.0, "temperature": 0.5, "regret_max": 0.9, "regret_response": "letter"}
 OLD |= {"fear_loss": "ce", "cost_margin": 0.0, "lambda_init": 0.78}
-OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1}
+OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1, "damping": 0.1, "init_fear": ""}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"

@@ -46,8 +46,8 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
       >>> metrics["violation_rate"].shape
       (2, 1)
     """
-    if config.init or config.init_fear:
-        raise UsageError("make_train starts anew; init and init_fear are for pmt train, which reads run folders")
+    if config.init:
+        raise UsageError("make_train starts anew; init is for pmt train, which reads run folders")
     setup = make_setup(config, env)
 
     def train(key: jax.Array, hyper: Hyper = setup.hyper) -> tuple[LearnerState, Metrics]:
