@@ -18,7 +18,7 @@ from .maths import distributions
 from .maths.pytree import pytree
 from .schedules import Schedule
 from .setup import Setup
-from .types import Hyper, Metrics, PolicySamples, TrainState
+from .types import Metrics, PolicySamples, TrainState
 
 EPS = 1e-8
 LINE_SEARCH_STEPS = 10
@@ -30,7 +30,7 @@ Hvp = Callable[[jax.Array], jax.Array]
 
 
 def trust_region_step(
-    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, samples: PolicySamples, violation: jax.Array
+    setup: Setup, now: Schedule, net: TrainState, samples: PolicySamples, violation: jax.Array
 ) -> tuple[TrainState, jax.Array, Metrics]:
     """One constrained step (MACPO): direction, line search. The optimiser's state is not touched.
 

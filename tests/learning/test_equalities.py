@@ -90,7 +90,7 @@ def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
     setup = dataclasses.replace(setup, method=METHODS["crpo"])
     reward, *cost = 10 * jax.random.normal(jax.random.key(2), (3, *batch.reward.shape))  # far from the floor
     none, chosen = jnp.zeros_like(batch.log_prob), jnp.asarray([[1.0], [0.0]])
-    rows = policies.policy_samples(setup, setup.hyper, chosen, batch, reward, jnp.stack(cost, -1)[..., None], none)
+    rows = policies.policy_samples(setup, chosen, batch, reward, jnp.stack(cost, -1)[..., None], none)
     for advantage, expected in zip(rows.advantage, (-cost[0], reward), strict=True):
         np.testing.assert_allclose(advantage, ((expected - expected.mean()) / expected.std()).ravel(), atol=1e-4)
 
@@ -224,7 +224,7 @@ def test_each_agent_is_corrected_by_the_ratios_of_those_before_it():
     noise = jax.random.normal(jax.random.key(2), (*batch.reward.shape, 2, 1))
     now = schedules.at(setup.config, hyper, state.update)
     rows = policies.policy_samples(
-        setup, hyper, state.constraint.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
+        setup, state.constraint.multiplier, batch, noise[..., 0, 0], noise, jnp.zeros_like(batch.log_prob)
     )
     excess = jnp.asarray([[0.5], [0.25]])
     team = policies.Team(state.actor, state.constraint, rows, excess)

@@ -262,7 +262,7 @@ def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     advantage, cost = 3.0 + 2.0 * jax.random.normal(jax.random.key(2), (2, *batch.reward.shape))
     costs = jnp.stack([cost, 2 * cost], -1)[..., None]
     price, excess = jnp.asarray([[0.5], [2.0]]), jnp.asarray([[0.5], [-0.25]])
-    rows = policies.policy_samples(setup, hyper, price, batch, advantage, costs, weights)
+    rows = policies.policy_samples(setup, price, batch, advantage, costs, weights)
     np.testing.assert_array_equal(rows.cost_advantage[1, :, 0], 2 * cost.ravel())  # not even centred
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     now = schedules.at(setup.config, hyper, state.update)
