@@ -33,8 +33,8 @@ STORED = {**runs.KINDS, **study.KINDS}
 
 def documents() -> list[pathlib.Path]:
     """The Markdown files that have blocks."""
-    candidates = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-    return [path for path in candidates if MARK.search(text := path.read_text()) or NUMBER.search(text)]
+    pages = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    return [path for path in pages if MARK.search(text := path.read_text()) or NUMBER.search(text)]
 
 
 def render(text: str, reports: Reports) -> str:

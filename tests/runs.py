@@ -66,7 +66,7 @@ def _key(setup: Setup, *more: object) -> Any:
     if setup.mesh or setup.debug or pathlib.Path(config.task).suffix:  # a file may have changed
         return None
     trials = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(vars(setup.trials) if setup.trials else None))
-    return repr(config.replace(init="", init_fear="")), repr(setup.method), trials, more
+    return repr(config.replace(init="")), repr(setup.method), trials, more
 
 
 def compile_once(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:

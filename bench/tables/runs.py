@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import json
 import math
 import pathlib
@@ -22,7 +21,7 @@ from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import TableRow, in_order, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
-from pmt_jax.studies.statistics import holm, iqm, mean_interval, u_test
+from pmt_jax.studies.statistics import iqm, mean_interval
 from pmt_jax.tasks import columns
 
 from .. import records
@@ -44,7 +43,7 @@ OLD |= {"kl_half_life": math.inf, "std_half_life": math.inf, "std_decay_start": 
 OLD |= {"value_norm_decay": 0.995, "limit_windup": 1.0, "lambda_lr": 0.1, "surrogate_weight": 1.0, "lambda_kd": 0.0}
 OLD |= {"fear_l2": 1.0, "regret_l2": 1.0, "temperature": 0.5, "regret_max": 0.9, "regret_response": "letter"}
 OLD |= {"fear_loss": "ce", "cost_margin": 0.0, "lambda_init": 0.78}
-OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1}
+OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1, "damping": 0.1, "init_fear": ""}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
@@ -256,26 +255,6 @@ def as_ran(files: pathlib.Path) -> str:
     return markdown(head, body)
 
 
-def as_pairs(file: pathlib.Path) -> str:
-    """Two-sided Mann-Whitney p of each pair of methods: above the diagonal of the reward, below it of the cost.
-
-    A line below the table has the lowest p of each measure with Holm's correction over the pairs.
-    """
-    found = in_order([row_of(run) for run in load(file)])
-    p = {of: [[u_test(x.scores[of], y.scores[of]) for y in found] for x in found] for of in ("reward", "cost")}
-    body = []
-    for i, row in enumerate(found):
-        line = [
-            "" if i == j else f"{p['reward' if i < j else 'cost'][i][j]:.3f}".lstrip("0") for j in range(len(found))
-        ]
-        body.append([f"`{row.label}`", *line])
-    pairs = list(itertools.combinations(range(len(found)), 2))
-    least = {of: min(holm([each[i][j] for i, j in pairs])) for of, each in p.items()}
-    words = " and ".join(f"{x:.3f} ({of})".lstrip("0") for of, x in least.items())
-    table = markdown(["", *(f"`{row.label}`" for row in found)], body)
-    return f"{table}\n\n*p of single pairs. The lowest with Holm's correction over the {len(pairs)} pairs: {words}.*"
-
-
 def _mean_std(*mean_and_std: float | None) -> str:
     """As `mean ± std`; some report no standard deviation. "-" if a seed broke, which has no score."""
     if mean_and_std[0] is None:
@@ -335,28 +314,13 @@ def as_mean_actions(file: pathlib.Path) -> str:
     return markdown((*head, *(f"mean actions: {name}" for name in head[2:])), body)
 
 
-def as_method(file: pathlib.Path) -> str:
-    """The method that `file` is named after on the README's tasks, MAPPO-Lagrangian below it."""
-    body = []
-    for name in HEADLINES:
-        found = {run["method"]: run for run in load(file.with_stem(name))}
-        for method in dict.fromkeys((file.stem, "mappo_l")):
-            (row,) = table.summarise([row_of(found[method])])
-            line = [f"`{row['task']}`", f"`{method}`"]
-            line += [_mean_std(row[figure]["mean"], row[figure]["std"]) for figure in ("reward", "cost")]
-            body.append([*line, f"{row['cost_limit']:g}", f"{round(row['within'] * row['seeds'])} of {row['seeds']}"])
-    return markdown(("task", "method", "reward", "cost", "limit", "seeds within"), body)
-
-
 KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "curves": as_pmt_table,
     "points": as_points,
     "mean_actions": as_mean_actions,
-    "method": as_method,
     "paper": as_paper,
     "summary": as_summary,
     "overview": as_overview,
     "larger": as_larger,
     "ran": as_ran,
-    "pairs": as_pairs,
 }

@@ -176,9 +176,9 @@ class MultiGoal:
 
     def _build_spec(self, variant: str) -> None:
         agents = range(self.num_agents)
-        blocks = [self._block(i) for i in agents]
-        state = tuple(Block(f"robot {i} {b.name}", *b[1:]) for i in agents for b in blocks[i])
-        observation = blocks[0] if self.own else state
+        blocks = self._blocks()
+        state = tuple(Block(f"robot {i} {b.name}", *b[1:]) for i in agents for b in blocks)
+        observation = blocks if self.own else state
         motors = self._kind.motors
         if self.robot == "point" and not self.own:
             actions = tuple(tuple(f"{motor} of robot {i}" for i in agents) for motor in motors)
@@ -206,7 +206,7 @@ class MultiGoal:
             cost_limit=(COST_LIMIT,) * num_costs if num_costs > 1 else COST_LIMIT,
         )
 
-    def _block(self, agent: int) -> Blocks:
+    def _blocks(self) -> Blocks:
         """What one robot senses."""
         goals = ["own goal", "other goals"] if self.own else [f"goal {j}" for j in range(self.num_agents)]
         things = goals + (["hazards", "vases"] if self.level else []) + (["other robots"] if self.own else [])

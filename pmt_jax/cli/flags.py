@@ -14,7 +14,6 @@ from ..config.settings import FIELDS, Config
 from .parser import EVERYTHING, HELP, path
 
 _METAVARS = {int: "N", float: "X"}
-_PATHS = ("init", "init_fear")
 _FIRST = ("method", "steps", "seeds", "seed", "num_envs", "rollout_length", "hidden", "actor_lr", "cost_limit")
 _FIRST += ("cost_margin", "physics", "env")  # what most people set, and `--help` without `all` shows
 _PREFIX = "set_"  # of the names under which argparse keeps settings
@@ -50,7 +49,7 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
     """The settings that the command line names."""
     pairs = vars(arguments).items()
     found = {name.removeprefix(_PREFIX): x for name, x in pairs if name.startswith(_PREFIX) and x is not None}
-    return found | {name: str(path(x)) for name, x in found.items() if name in _PATHS and x}
+    return found | ({"init": str(path(found["init"]))} if found.get("init") else {})
 
 
 class _Help(argparse.Action):

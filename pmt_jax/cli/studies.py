@@ -132,7 +132,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     with trusting(arguments.trust):
         named = [name for config in points.values() for name in (config.task, config.method)]
         check_source(source, named, [arguments.set_method or "", *_methods(words)])
-        for run in {run for config in points.values() for run in (config.init, config.init_fear) if run}:
+        for run in {config.init for config in points.values() if config.init}:
             check_trusted(pathlib.Path(run))  # here, because worker processes do not ask again
         if share := shares.read(arguments.part) if arguments.part else shares.of_array():
             if arguments.jobs > 1:

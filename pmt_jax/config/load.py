@@ -23,7 +23,7 @@ from .settings import FIELDS, Config
 
 _PACKAGE = pathlib.Path(__file__).parents[1]
 CONFIG_DIR = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
-_PRESETS = "presets"
+_PRESETS = CONFIG_DIR / "presets.toml"
 
 Table = dict[str, Any]
 
@@ -43,7 +43,7 @@ def load_config(
         a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
       method: a name in METHODS, or a Python file with a row of your own (`my_methods.py:dread`); the file's own choice
         if None.
-      preset: a file of configs/presets.
+      preset: a table of configs/presets.toml.
       **overrides: any field of Config.
 
     Raises:
@@ -104,16 +104,13 @@ def to_toml(config: Config) -> str:
 
 def names() -> list[str]:
     """The configurations that come with the package, each named by its path in configs/: `lane`, `paper/ant_2x4`."""
-    return [name for name in _names(CONFIG_DIR) if not name.startswith(f"{_PRESETS}/")]
+    files = set(CONFIG_DIR.rglob("*.toml")) - {_PRESETS}
+    return sorted(path.relative_to(CONFIG_DIR).with_suffix("").as_posix() for path in files)
 
 
 def presets() -> dict[str, str]:
     """What can be laid over any configuration: {name: one sentence about it}."""
-    return {name: about(f"{_PRESETS}/{name}") for name in _names(CONFIG_DIR / _PRESETS)}
-
-
-def _names(folder: pathlib.Path) -> list[str]:
-    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.toml"))
+    return {name: str(table["about"]) for name, table in _parse(_PRESETS).items()}
 
 
 def about(name: str) -> str:
@@ -140,9 +137,10 @@ def read_preset(name: str) -> Table:
     Raises:
       UsageError: there is none of that name.
     """
-    if name not in _names(CONFIG_DIR / _PRESETS):
-        raise UsageError(f"unknown preset '{name}'{did_you_mean(name, _names(CONFIG_DIR / _PRESETS))}")
-    return read(CONFIG_DIR / _PRESETS / f"{name}.toml")
+    tables = _parse(_PRESETS)
+    if name not in tables:
+        raise UsageError(f"unknown preset '{name}'{did_you_mean(name, tables)}")
+    return {key: value for key, value in tables[name].items() if key != "about"}
 
 
 def resume_command(out: str) -> str:

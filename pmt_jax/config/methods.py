@@ -112,8 +112,8 @@ def find(name: str) -> Method:
     Raises:
       UsageError: there is none, or the file cannot be imported.
     """
-    if not is_file(name):
-        return METHODS[known(name)]
+    if known(name) in METHODS:
+        return METHODS[name]
     found, chosen = members(name)
     rows = {key: value for key, value in found.items() if isinstance(value, Method) and not key.startswith("_")}
     if chosen is None and len(rows) == 1:

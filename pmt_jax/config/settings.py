@@ -108,9 +108,6 @@ class Hyper:
         NOT_NEGATIVE,
     )
     lambda_max: float = constraint(20.0, "upper bound of the multiplier, and P3O's weight of the penalty", NOT_NEGATIVE)
-    surrogate_weight: float = constraint(
-        0.0, "weight of the mean of ratio * cost advantage in the multiplier's step (Eq. 16)", NOT_NEGATIVE
-    )
     emotion_lr: float = emotion(1e-3, "learning rate of the fear and regret networks (Adam)", NOT_NEGATIVE)
     emotion_l2: float = emotion(
         1.0, "weight of the squared change of fear and regret since collection (their cognitive error)", NOT_NEGATIVE
@@ -129,7 +126,6 @@ class Hyper:
     kl_limit: float = constraint(
         0.01, "size of MACPO's trust region, mean KL in nats, and FOCOPS's bound on the KL of each sample", POSITIVE
     )
-    damping: float = constraint(0.1, "added to the Fisher matrix", NOT_NEGATIVE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,9 +175,6 @@ class Config(Hyper):
     )
     fear_time: Literal["next", "current"] = emotion(
         "next", "fear of the state to which an action leads, or of the state in which it is taken"
-    )
-    init_fear: str = emotion(
-        "", "run folder whose fear network is the start, as a prior; agents of another team start with its mean"
     )
     emotion_epochs: int = emotion(4, "passes over the batch for the fear and regret networks", COUNT)
     physics: Literal["auto", "fused", "mjx", "warp", "mujoco"] = simulation(

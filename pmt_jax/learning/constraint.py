@@ -179,6 +179,9 @@ def respond(
 ) -> Constraint:
     """One agent's constraint [K] after its policy has changed.
 
+    The letter's multiplier adds the surrogate I of Eq. 16 to its excess. Other methods leave it out: after an update I
+    is below 0 however high the cost, so the cost would settle above the limit.
+
     Args:
       samples: the agent's, [R, ...]; excess: [K]; log_ratio: [R], by how much the policy changed.
       reach: [], the most that a step of the trust region promised to take off the cost, in units of the limit.
@@ -188,13 +191,13 @@ def respond(
         return dataclasses.replace(constraint, lowered=lowered)
     if setup.method.constraint != "lagrangian":
         return constraint
-    surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
     if setup.method.letter:
-        step = excess + hyper.surrogate_weight * setup.config.rollout_length * surrogate
+        surrogate = surrogate_cost(log_ratio, samples.log_weight, samples.cost_advantage)
+        step = excess + setup.config.rollout_length * surrogate  # the paper's I is a sum over steps
         updated = dual_update(constraint.multiplier, step, hyper.lambda_lr, hyper.lambda_max)
     else:
-        step, lowest = cut(excess + hyper.surrogate_weight * surrogate), LAMBDA_MIN * hyper.lambda_init
-        updated = relative_update(constraint.multiplier, step, gain(setup, hyper), lowest, hyper.lambda_max)
+        lowest = LAMBDA_MIN * hyper.lambda_init
+        updated = relative_update(constraint.multiplier, cut(excess), gain(setup, hyper), lowest, hyper.lambda_max)
     return dataclasses.replace(constraint, multiplier=updated)
 
 
@@ -244,7 +247,7 @@ def relative_update(
     costs would take as long to undo, and in the end 0 would never move again.
 
     Args:
-      multiplier: [...], lambda > 0; excess: [...], measured and expected, x = S + I, in units of the limit, `cut`.
+      multiplier: [...], lambda > 0; excess: [...], x = S in units of the limit, `cut`.
     """
     return jnp.clip(multiplier * (1 + lambda_lr * excess), lambda_min, lambda_max)
 

@@ -46,8 +46,8 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
       >>> metrics["violation_rate"].shape
       (2, 1)
     """
-    if config.init or config.init_fear:
-        raise UsageError("make_train starts anew; init and init_fear are for pmt train, which reads run folders")
+    if config.init:
+        raise UsageError("make_train starts anew; init is for pmt train, which reads run folders")
     setup = make_setup(config, env)
 
     def train(key: jax.Array, hyper: Hyper = setup.hyper) -> tuple[LearnerState, Metrics]:
@@ -152,7 +152,7 @@ def train_step(setup: Setup, hyper: Hyper, state: LearnerState) -> tuple[Learner
     price = partial(constraint.price, setup, hyper, excess=excess, estimate=previous)
     held = constraint.integrate(setup, hyper, state.constraint, excess)
     signals = (advantage, cost_advantage, log_weight, memory and memory.actor)
-    actor_samples = policy_samples(setup, hyper, price(held.multiplier), batch, *signals)
+    actor_samples = policy_samples(setup, price(held.multiplier), batch, *signals)
 
     # 5 Critics, and coping response: every agent's policy, and its multipliers.
     samples, cost_samples = (seen, value, returns), (cost_seen, cost_value, cost_returns)

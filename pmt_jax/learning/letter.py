@@ -18,7 +18,7 @@ from .optimise import fit, init_train_state, shuffled
 from .rollout import flatten_steps
 from .schedules import Schedule
 from .setup import Setup
-from .types import Batch, Hyper, Metrics, Params, RehearsingState, TrainState
+from .types import Batch, Hyper, Metrics, Params, ReplayState, TrainState
 
 UPDATES = 16  # that the replay buffer remembers
 MOST_STATES = 1024  # of one update in it
@@ -29,11 +29,11 @@ TEMPERATURE = 0.5  # of the relaxed samples
 # Fear
 
 
-def init_fear(setup: Setup, key: jax.Array) -> RehearsingState:
+def init_fear(setup: Setup, key: jax.Array) -> ReplayState:
     """A fear network for each agent, weights with a leading [N], and an empty replay buffer."""
     net = jax.vmap(init_train_state)(setup.nets.init_fear(key, 0.0))
     spec, states = setup.vector.spec, (UPDATES, min(setup.config.batch_size, MOST_STATES))
-    return RehearsingState(
+    return ReplayState(
         net.params,
         net.opt_state,
         state=jnp.zeros((*states, spec.state_dim)),
@@ -56,25 +56,25 @@ def appraise_fear(
     Equations 3 and 4 as printed: each agent's own network is fitted to the batch's costs, and keeps to what it said of
     the states of its replay buffer. Fear is fitted after its use, as a value function is.
     """
-    if not isinstance(net, RehearsingState):
+    if not isinstance(net, ReplayState):
         return fear.appraise_fear(setup, hyper, now, net, batch, largest, key)
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
     signal = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     state, cost, answer = jax.tree.map(flatten_steps, (seen, batch.cost, signal))
     memory_key, draw_key = jax.random.fold_in(key, 3), jax.random.fold_in(key, 4)
     net = remember(net, state, answer, memory_key)
-    rehearsed = draw(net, len(state), draw_key)
+    replayed = draw(net, len(state), draw_key)
     noise = jax.random.logistic(jax.random.fold_in(key, 2), cost.shape)
 
     def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         *states, cost, noise, answer = samples
-        logits, rehearsed = setup.nets.fear_of_one(params, jnp.stack(states))
+        logits, replayed = setup.nets.fear_of_one(params, jnp.stack(states))
         distance = divergence(logits, cost, noise)
-        return appraisal_loss(distance, rehearsed, answer, jnp.ones_like(cost), hyper.emotion_l2), {}
+        return appraisal_loss(distance, replayed, answer, jnp.ones_like(cost), hyper.emotion_l2), {}
 
     passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.emotion_lr, "max_grad_norm": hyper.max_grad_norm}
-    samples = (state, rehearsed[0], cost, noise, rehearsed[1])
+    samples = (state, replayed[0], cost, noise, replayed[1])
     learned, metrics = jax.vmap(
         lambda net, samples: fit(net, loss, samples, key, **limits, **passes), in_axes=(0, (None, None, 1, 1, 1))
     )(TrainState(net.params, net.opt_state), samples)
@@ -102,7 +102,7 @@ def relaxed_bernoulli(logits: jax.Array, noise: jax.Array, temperature: jax.Arra
     return jax.nn.sigmoid((logits + noise) / temperature)
 
 
-def remember(net: RehearsingState, state: jax.Array, answer: jax.Array, key: jax.Array) -> RehearsingState:
+def remember(net: ReplayState, state: jax.Array, answer: jax.Array, key: jax.Array) -> ReplayState:
     """Stores an update's states [R, S] and what the networks say of them [R, N, K]: M at random, for the oldest M."""
     rows = shuffled(key, len(state))[: net.state.shape[1]]
     place = net.count % UPDATES
@@ -114,7 +114,7 @@ def remember(net: RehearsingState, state: jax.Array, answer: jax.Array, key: jax
     )
 
 
-def draw(net: RehearsingState, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def draw(net: ReplayState, count: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`count` stored states s_D [count, S] and what was said of them, f_D [count, N, K]; any may come again."""
     stored = jnp.minimum(net.count, UPDATES) * net.state.shape[1]
     rows = jax.random.randint(key, (count,), 0, stored)

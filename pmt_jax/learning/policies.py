@@ -48,7 +48,6 @@ def update_policies(
 
 def policy_samples(
     setup: Setup,
-    hyper: Hyper,
     price: jax.Array,
     batch: Batch,
     advantage: jax.Array,
@@ -184,7 +183,7 @@ def update_policy(
       0; metrics.
     """
     if setup.method.constraint == "trust_region":
-        return trust_region_step(setup, hyper, now, net, samples, violation)
+        return trust_region_step(setup, now, net, samples, violation)
     passes = {"epochs": setup.config.epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.actor_lr, "max_grad_norm": hyper.max_grad_norm}
     loss = policy_loss(setup, hyper, now, samples, violation)

@@ -18,18 +18,19 @@ from .maths import distributions
 from .maths.pytree import pytree
 from .schedules import Schedule
 from .setup import Setup
-from .types import Hyper, Metrics, PolicySamples, TrainState
+from .types import Metrics, PolicySamples, TrainState
 
 EPS = 1e-8
 LINE_SEARCH_STEPS = 10
 STEP_DECAY = 0.8  # factor between one step of the line search and the next
+DAMPING = 0.1  # added to the Fisher matrix
 KL_SLACK = 1.5  # a step is accepted up to this multiple of the trust region
 
 Hvp = Callable[[jax.Array], jax.Array]
 
 
 def trust_region_step(
-    setup: Setup, hyper: Hyper, now: Schedule, net: TrainState, samples: PolicySamples, violation: jax.Array
+    setup: Setup, now: Schedule, net: TrainState, samples: PolicySamples, violation: jax.Array
 ) -> tuple[TrainState, jax.Array, Metrics]:
     """One constrained step (MACPO): direction, line search. The optimiser's state is not touched.
 
@@ -66,7 +67,7 @@ def trust_region_step(
     (g,), (b,) = pull((one, zero)), pull((zero, one))
     _, fisher = jax.linearize(jax.grad(divergence), start)
     uncoupled, _ = ravel_pytree(setup.nets.is_std(unravel(start)))
-    direction = constrained_direction(g, b, c, lambda v: fisher(v) + hyper.damping * v, now.kl_limit, uncoupled)
+    direction = constrained_direction(g, b, c, lambda v: fisher(v) + DAMPING * v, now.kl_limit, uncoupled)
 
     def accept(flat: jax.Array) -> jax.Array:
         loss, cost = objectives(flat)

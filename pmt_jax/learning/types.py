@@ -46,8 +46,8 @@ class TrainState:
 
 
 @pytree
-class RehearsingState(TrainState):
-    """A network in training with the replay buffer D that it rehearses: U updates of M states (see letter.py).
+class ReplayState(TrainState):
+    """A network in training with the replay buffer D from which it learns again: U updates of M states (see letter.py).
 
     state: [U, M, S] as the network saw them; answer: [U, M, N, K], what it said of them then; count: [] int32, updates
     stored so far, the latest in place of the oldest.
@@ -236,7 +236,7 @@ class LearnerState(ActingState):
       actor, obs_moments, update: of ActingState.
       critic: V(s) -> []; cost_critic: Vc(s) -> [N, K]; of each agent's own observation V(o_i) -> [], Vc(o_i) -> [K].
       fear: f(s') -> logits [N, K]; regret: r(s, a_i) -> logits [A], weights with a leading [N]; None in methods
-        without them. With the letter fear has a network for each agent, and is a RehearsingState.
+        without them. With the letter fear has a network for each agent, and is a ReplayState.
       constraint: estimate of the cost, multiplier and lowered limit, [N, K].
       largest_cost: [N, K], the largest cost of a step so far that was noticed; fear is a share of it.
       state_moments: [S], of raw states.

@@ -1,16 +1,19 @@
 """Trained policies that come with the package, one a task and method, under names like `hub:ant_2x4/r4sg`.
 
-Each is a small npz: the run's settings, the part of its best seed's learner state that acts, and its evaluation.
-SHA256SUMS next to them has the checksum of each, as `sha256sum` writes it. Kernels are 8-bit integers with a scale per
-output, the rest is stored as it is: docs/howto/pretrained.md has the error.
+The policies of a task are an archive, `ant_2x4.zip`, and each is a small npz in it: the run's settings, the part of its
+best seed's learner state that acts, and its evaluation. SHA256SUMS next to the archives has the checksum of each
+policy, as `sha256sum` writes it. Kernels are 8-bit integers with a scale per output, the rest is stored as it is:
+docs/howto/pretrained.md has the error.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import pathlib
 import tomllib
+import zipfile
 from typing import Any
 
 import jax
@@ -30,6 +33,8 @@ from ..training import checkpoint
 FOLDER = pathlib.Path(__file__).parent / "pretrained"
 CHECKSUMS = "SHA256SUMS"
 PREFIX = "hub:"
+# What zipfile raises, by where an archive is damaged.
+UNREADABLE = (OSError, EOFError, KeyError, RuntimeError, ValueError, zipfile.BadZipFile)
 LEVELS = 127  # of an 8-bit integer, on either side of 0
 NOTHING = np.float32(1e-30)  # a weight so small is none
 _SCALE = "/scale"  # of the kernel whose path stands before it
@@ -41,21 +46,30 @@ def is_name(source: str | pathlib.Path) -> bool:
 
 
 def names() -> list[str]:
-    """All pretrained policies, those whose file is damaged or lost included."""
-    files = {file.name for file in FOLDER.glob("*.npz")} | _checksums().keys()
-    return sorted(PREFIX + file.removesuffix(".npz").replace("-", "/") for file in files)
+    """All pretrained policies, those that are damaged or lost included."""
+    found = {f"{file.stem}/{member}" for file in FOLDER.glob("*.zip") for member in _members(file)}
+    return sorted(PREFIX + policy.removesuffix(".npz") for policy in found | _checksums().keys())
 
 
 def file_of(name: str) -> pathlib.Path:
-    """Where a policy of that name is kept, whether or not there is one."""
-    return FOLDER / f"{name.removeprefix(PREFIX).replace('/', '-')}.npz"
+    """The archive in which a policy of that name is kept, whether or not there is one."""
+    return FOLDER / f"{_task(name)}.zip"
+
+
+def size(name: str) -> int:
+    """How many bytes a policy has.
+
+    Raises:
+      UsageError: as `about`.
+    """
+    return len(_bytes(name))
 
 
 def about(name: str) -> dict[str, Any]:
     """The description of a policy: its evaluation, its origin, the error of packing (see docs/howto/pretrained.md).
 
     Raises:
-      UsageError: there is no such policy, or its file is damaged.
+      UsageError: there is no such policy, or it is damaged.
     """
     return json.loads(str(_read(name)["about"]))
 
@@ -67,7 +81,7 @@ def load(name: str, physics: str | None = None) -> tuple[Setup, ActingState]:
       physics: the engine to simulate with, in place of the fastest for the device.
 
     Raises:
-      UsageError: there is no such policy, its file is damaged, or the engine cannot run here.
+      UsageError: there is no such policy, it is damaged, or the engine cannot run here.
     """
     table = _read(name)
     stored = tomllib.loads(str(table.pop("config")))
@@ -110,38 +124,67 @@ def rounded(state: ActingState) -> ActingState:
 
 
 def _write(name: str, table: dict[str, np.ndarray]) -> None:
-    with writing(file_of(name)) as partial:
-        np.savez_compressed(partial, **table)  # pyright: ignore[reportArgumentType] (its stub)
-        checksum = _checksum(partial)
-    sums = _checksums() | {file_of(name).name: checksum}
+    file, packed = file_of(name), io.BytesIO()
+    np.savez_compressed(packed, **table)  # pyright: ignore[reportArgumentType] (its stub)
+    policies = {member: _stored(file, member) for member in _members(file)} | {_member(name): packed.getvalue()}
+    with writing(file) as partial, zipfile.ZipFile(partial, "w") as archive:
+        for member in sorted(policies):
+            archive.writestr(zipfile.ZipInfo(member), policies[member])  # without the time: the same bytes every time
+    sums = _checksums() | {f"{_task(name)}/{_member(name)}": hashlib.sha256(packed.getvalue()).hexdigest()}
     with writing(FOLDER / CHECKSUMS) as partial:
-        partial.write_text("".join(f"{sums[file]}  {file}\n" for file in sorted(sums)))
+        partial.write_text("".join(f"{sums[policy]}  {policy}\n" for policy in sorted(sums)))
 
 
 def _read(name: str) -> dict[str, np.ndarray]:
-    if name not in names():
-        raise UsageError(f"unknown policy '{name}'{did_you_mean(name, names())} (pmt hub lists all)")
-    file = file_of(name)
-    if _checksums().get(file.name, "none") != _checksum(file):
-        raise UsageError(
-            f"{name} is damaged: {file} is missing or not as {CHECKSUMS} next to it lists it; install pmt-jax anew"
-        )
-    with np.load(file) as table:
+    with np.load(io.BytesIO(_bytes(name))) as table:
         return dict(table)
 
 
+def _bytes(name: str) -> bytes:
+    """A policy's npz, which is as it was when its checksum was written."""
+    if name not in names():
+        raise UsageError(f"unknown policy '{name}'{did_you_mean(name, names())} (pmt hub lists all)")
+    data = _stored(file_of(name), _member(name))
+    if _checksums().get(f"{_task(name)}/{_member(name)}") != hashlib.sha256(data).hexdigest():
+        raise UsageError(
+            f"{name} is damaged: {file_of(name)} is missing, or has it not as {CHECKSUMS} lists it; install "
+            "pmt-jax anew"
+        )
+    return data
+
+
+def _task(name: str) -> str:
+    return name.removeprefix(PREFIX).partition("/")[0]
+
+
+def _member(name: str) -> str:
+    return f"{name.partition('/')[2]}.npz"
+
+
+def _members(file: pathlib.Path) -> list[str]:
+    """The policies of an archive; none if it cannot be read."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return archive.namelist()
+    except UNREADABLE:
+        return []
+
+
+def _stored(file: pathlib.Path, member: str) -> bytes:
+    """A policy's npz as it is in the archive; nothing if it cannot be read."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            info = archive.getinfo(member)
+            return archive.read(info) if info.compress_type == zipfile.ZIP_STORED else b""
+    except UNREADABLE:
+        return b""
+
+
 def _checksums() -> dict[str, str]:
-    """The files that belong to the package, and their checksums."""
+    """The policies that belong to the package, as TASK/METHOD.npz, and their checksums."""
     file = FOLDER / CHECKSUMS
     lines = file.read_text(errors="replace").splitlines() if file.is_file() else []
-    return {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
-
-
-def _checksum(file: pathlib.Path) -> str:
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError:
-        return "unreadable"
+    return {policy: checksum for checksum, _, policy in (line.partition("  ") for line in lines)}
 
 
 def _narrowed(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -157,4 +157,4 @@ def action_change(run: Setup, packed: ActingState, original: ActingState, enviro
 
 def rows() -> list[dict[str, Any]]:
     """What is known about every pretrained policy, and its size in bytes."""
-    return [{"name": name, "bytes": hub.file_of(name).stat().st_size, **hub.about(name)} for name in hub.names()]
+    return [{"name": name, "bytes": hub.size(name), **hub.about(name)} for name in hub.names()]

@@ -34,7 +34,7 @@ from .loggers import Jsonl, Logger, open_loggers
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 # What --change keeps: who the run is, and what is read at its start only.
-FIXED = ("task", "method", "seed", "seeds", "init", "init_fear", "num_envs", "rollout_length", "episode_starts")
+FIXED = ("task", "method", "seed", "seeds", "init", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 

@@ -513,17 +513,6 @@ def test_points_have_true_costs_if_some_were_not_noticed(tmp_path: pathlib.Path)
         assert columns in runs.as_points(file).splitlines()[0]
 
 
-def test_pairs_say_what_survives_a_correction(tmp_path: pathlib.Path):
-    """Five seeds against five have p = .008 at best, which Holm multiplies by the number of pairs."""
-    (one,) = [run for run in stored()["table1_ant_2x4_h200"] if run["method"] == "happo"]
-    file = tmp_path / "x.json"
-    apart = [one | {"table": one["table"] | {"cost": [k + 10.0 * i for k in range(5)]}} for i in range(3)]
-    for i, method in enumerate(("happo", "mappo", "macpo")):
-        apart[i] |= {"method": method}
-    file.write_text(json.dumps(apart))
-    assert runs.as_pairs(file).splitlines()[-1].endswith("over the 3 pairs: 1.000 (reward) and .024 (cost).*")
-
-
 def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
     run = fake_run(tmp_path / "run", cost_limit=1)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]

@@ -137,7 +137,7 @@ def test_a_home_that_the_shell_left_is_expanded(whole: pathlib.Path, tmp_path: p
     home = tmp_path / "home"
     home.mkdir()
     assert cli("table", whole, "-o=~/table.md")[0] == 0 and (home / "table.md").is_file()
-    for flags in (("--out=~/x", "--resume"), ("--init=~/x",), ("--init-fear=~/x",)):
+    for flags in (("--out=~/x", "--resume"), ("--init=~/x",)):
         code, _, err = cli("train", "lane", "--method", "f4sg", *TINY, "--out", tmp_path / "run", *flags)
         assert code == 2 and str(home / "x") in err, err
     assert cli("train", "lane", *TINY, "--profile=~/trace", "--out=~/x", "--resume")[0] == 2

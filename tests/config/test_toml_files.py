@@ -65,13 +65,13 @@ def test_the_papers_settings_extend_the_tasks_own():
     assert (paper.task, paper.seeds, paper.steps, paper.env) == ("ant_2x4", 5, 10_000_000, own.env)
 
 
-def test_every_file_describes_itself():
+def test_every_file_and_every_preset_describes_itself():
     assert all(load.about(name) for name in load.names()) and all(load.presets().values())
 
 
 def test_all_files_are_packaged():
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    folders = {"": "pmt_jax.configs", "paper": "pmt_jax.configs.paper", "presets": "pmt_jax.configs.presets"}
+    folders = {"": "pmt_jax.configs", "paper": "pmt_jax.configs.paper"}
     packaged = {
         path
         for folder, package in folders.items()

@@ -19,7 +19,7 @@ from pmt_jax.learning import critics, learner, letter, policies, schedules
 from pmt_jax.learning.maths import losses
 from pmt_jax.learning.maths.advantages import gae
 from pmt_jax.learning.optimise import fit
-from pmt_jax.learning.types import Batch, LearnerState, RehearsingState, Tag
+from pmt_jax.learning.types import Batch, LearnerState, ReplayState, Tag
 from pmt_jax.training import checkpoint, outlook
 from runs import TINY, assert_same_run
 from small import SMALL, program
@@ -59,17 +59,17 @@ def appraise(part: str):
 # Equations 3 and 4: fear
 
 
-def rehearsing(count: int = 3) -> RehearsingState:
+def replaying(count: int = 3) -> ReplayState:
     """Networks whose replay buffer has states and answers that they would not give."""
     net = acted("f4sg_letter")[0].fear
-    assert isinstance(net, RehearsingState)
+    assert isinstance(net, ReplayState)
     state, answer = (jax.random.normal(jax.random.key(5), x.shape) for x in (net.state, net.answer))
     return dataclasses.replace(net, state=state, answer=jax.nn.sigmoid(answer), count=jnp.int32(count))
 
 
 def test_the_loss_is_the_reversed_divergence_and_the_change_of_what_was_said_of_stored_states():
     _, batch = acted("f4sg_letter")
-    net, key = rehearsing(), jax.random.key(7)
+    net, key = replaying(), jax.random.key(7)
     hyper = F4SG.hyper(emotion_lr=0.0, emotion_l2=0.5)
     after, _, metrics = appraise("fear")(hyper, net, batch, key)
 
@@ -264,7 +264,7 @@ def test_policies_have_advantages_as_they_are_and_multipliers_sum_over_steps():
     advantage, cost = 3.0 + 2.0 * jax.random.normal(jax.random.key(2), (2, *batch.reward.shape))
     costs = jnp.stack([cost, 2 * cost], -1)[..., None]
     price, excess = jnp.asarray([[0.5], [2.0]]), jnp.asarray([[0.5], [-0.25]])
-    rows = policies.policy_samples(setup, hyper, price, batch, advantage, costs, weights)
+    rows = policies.policy_samples(setup, price, batch, advantage, costs, weights)
     np.testing.assert_array_equal(rows.cost_advantage[1, :, 0], 2 * cost.ravel())  # not even centred
     tagged = {tag: jax.random.fold_in(jax.random.key(1), tag) for tag in Tag}
     now = schedules.at(setup.config, hyper, state.update)

@@ -108,9 +108,7 @@ def test_sequences_give_the_policy_that_acted(method: str):
     assert before.rollout.memory
     none = jnp.zeros_like(batch.log_prob)
     price, cost = jnp.ones((2, 1)), none[..., None]
-    samples = policies.policy_samples(
-        setup, setup.hyper, price, batch, batch.reward, cost, none, before.rollout.memory.actor
-    )
+    samples = policies.policy_samples(setup, price, batch, batch.reward, cost, none, before.rollout.memory.actor)
     params = setup.nets.of_all(before.actor.params)
     log_ratio, kl = jax.vmap(functools.partial(policies.policy_change, setup))(params, samples)
     np.testing.assert_allclose(log_ratio, 0, atol=2e-5)

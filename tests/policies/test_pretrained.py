@@ -10,18 +10,20 @@ import pathlib
 import re
 import shutil
 import tomllib
+import zipfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bench.tables import speed
 from paths import ROOT
 from pmt_jax import load_config, load_policy, make_setup
+from pmt_jax.errors import UsageError
 from pmt_jax.learning import learner
 from pmt_jax.learning.maths import running_moments
 from pmt_jax.learning.types import ActingState, Best, LearnerState, RunningMoments, TrainState
@@ -30,6 +32,7 @@ from pmt_jax.training import run_folder
 from pmt_jax.training.checkpoint import Checkpoints, Provenance
 
 NAMES = hub.names()
+WITH_THE_PACKAGE = hub.FOLDER
 
 
 @pytest.fixture
@@ -76,7 +79,7 @@ def test_the_best_policy_of_a_run_is_published_and_used_by_name(empty_hub: pathl
     # The lane's point comes to rest at twice the push; beyond 0.5 it costs, the nearer to 1 the better.
     out = untrained(tmp_path / "lane", last=(0.5, 0.0), best=(0.2, 0.1))
     facts = publish.publish(out, 8)
-    assert [p.relative_to(empty_hub).as_posix() for p in empty_hub.rglob("*.npz")] == ["lane-r4sg.npz"]
+    assert {p.relative_to(empty_hub).as_posix() for p in empty_hub.rglob("*")} == {"lane.zip", hub.CHECKSUMS}
     assert hub.about("hub:lane/r4sg") == facts
     assert (facts["seed"], facts["which"]) == (3, "best") and facts["figures"]["episode_cost"] == [0, 0]
 
@@ -160,21 +163,18 @@ def test_what_is_told_about_them_and_how_large_they_are():
     assert sum(row["bytes"] for row in found) < 4e6
 
 
-def test_their_checksums_are_those_of_their_files():
-    """As `sha256sum -c` reads them."""
-    lines = [line.split("  ") for line in (hub.FOLDER / "SHA256SUMS").read_text().splitlines()]
-    files = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in hub.FOLDER.glob("*.npz")}
-    assert files == {name: checksum for checksum, name in lines} and len(lines) == len(files) == len(NAMES)
+def test_their_checksums_are_as_sha256sum_writes_them(tmp_path: pathlib.Path):
+    """`sha256sum -c` reads them where each archive lies unpacked in a folder of its name."""
+    lines = [line.split("  ") for line in (hub.FOLDER / hub.CHECKSUMS).read_text().splitlines()]
+    for file in hub.FOLDER.glob("*.zip"):
+        zipfile.ZipFile(file).extractall(tmp_path / file.stem)
+    files = {file: hashlib.sha256((tmp_path / file).read_bytes()).hexdigest() for _, file in lines}
+    assert files == {file: checksum for checksum, file in lines}
+    assert len(lines) == len(files) == len(NAMES) == len(list(tmp_path.rglob("*.npz")))
 
 
 def cut(file: pathlib.Path) -> None:
     file.write_bytes(file.read_bytes()[:-1])
-
-
-def flip(file: pathlib.Path) -> None:
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 1
-    file.write_bytes(data)
 
 
 def replace_by_a_folder(file: pathlib.Path) -> None:
@@ -182,38 +182,96 @@ def replace_by_a_folder(file: pathlib.Path) -> None:
     file.mkdir()
 
 
-DAMAGE = {
+def rewrite(file: pathlib.Path, **changes: bytes | None) -> None:
+    """Other bytes for some policies of an archive, or with None no such policy."""
+    with zipfile.ZipFile(file) as archive:
+        policies = {member.removesuffix(".npz"): archive.read(member) for member in archive.namelist()} | changes
+    with zipfile.ZipFile(file, "w") as archive:
+        for method, data in policies.items():
+            if data is not None:
+                archive.writestr(f"{method}.npz", data)
+
+
+def flip(file: pathlib.Path) -> None:
+    """A bit in the middle of happo's policy."""
+    data, policy = bytearray(file.read_bytes()), zipfile.ZipFile(file).read("happo.npz")
+    data[data.index(policy) + len(policy) // 2] ^= 1
+    file.write_bytes(data)
+
+
+OF_THE_ARCHIVE = {
     "empty": lambda file: file.write_bytes(b""),
     "cut": cut,
-    "flipped": flip,
     "text": lambda file: file.write_text("no archive"),
     "lost": lambda file: file.unlink(),
     "folder": replace_by_a_folder,
-    "of another method": lambda file: shutil.copy(hub.file_of("hub:ant_2x4/mappo"), file),
+}
+OF_HAPPO = {
+    "flipped": flip,
+    "of another method": lambda file: rewrite(file, happo=zipfile.ZipFile(file).read("mappo.npz")),
+    "left out": lambda file: rewrite(file, happo=None),
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_policy_costs_only_itself(damage: str, tmp_path: pathlib.Path, monkeypatch, cli):
+@pytest.mark.parametrize("damage", OF_THE_ARCHIVE | OF_HAPPO)
+def test_damage_costs_only_what_is_damaged(damage: str, tmp_path: pathlib.Path, monkeypatch, cli):
     shutil.copytree(hub.FOLDER, tmp_path / "hub")
     monkeypatch.setattr(hub, "FOLDER", tmp_path / "hub")
     monkeypatch.chdir(tmp_path)
     name = "hub:ant_2x4/happo"
-    DAMAGE[damage](hub.file_of(name))
+    (OF_THE_ARCHIVE | OF_HAPPO)[damage](hub.file_of(name))
+    lost = [name] if damage in OF_HAPPO else [other for other in NAMES if other.startswith("hub:ant_2x4/")]
+    assert hub.names() == NAMES
     code, out, err = cli("hub")
-    assert code == 0 and err.count("\n") == 1 and err.startswith(f"left out: {name} is damaged: ")
-    assert [line.split()[0] for line in out.splitlines()[1:]] == [other for other in NAMES if other != name]
+    assert code == 0 and [line.split(" is damaged: ")[0] for line in err.splitlines()] == [
+        f"left out: {each}" for each in lost
+    ]
+    assert [line.split()[0] for line in out.splitlines()[1:]] == [other for other in NAMES if other not in lost]
     for command in (("eval", name), ("render", name, "-o", "x.html"), ("export", name, "-o", "x"), ("train", "lane")):
         init = ("--init", name) if command[0] == "train" else ()
         code, _, err = cli(*command, *init)
         assert code == 2 and err.count("\n") == 1 and f"{name} is damaged: {hub.file_of(name)}" in err
-    assert hub.about("hub:ant_2x4/mappo")["method"] == "mappo"
+    sound = "hub:ant_2x4/mappo" if damage in OF_HAPPO else "hub:ant_4x2/mappo"
+    assert hub.about(sound)["method"] == "mappo"
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_policy_of_a_damaged_archive_is_as_it_was_or_damaged(data: st.DataObject, empty_hub: pathlib.Path):
+    """Whatever bytes have changed, also those that say how an archive is packed."""
+    empty_hub.mkdir(exist_ok=True)
+    sums, npz = [], {method: hashlib.sha256(method.encode()).digest() for method in ("happo", "mappo")}
+    with zipfile.ZipFile(empty_hub / "lane.zip", "w") as archive:
+        for method, whole in npz.items():
+            archive.writestr(zipfile.ZipInfo(f"{method}.npz"), whole)
+            sums.append(f"{hashlib.sha256(whole).hexdigest()}  lane/{method}.npz\n")
+    (empty_hub / hub.CHECKSUMS).write_text("".join(sums))
+    changed = bytearray((empty_hub / "lane.zip").read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
+    (empty_hub / "lane.zip").write_bytes(changed[: data.draw(st.integers(0, len(changed)))])
+    for method, whole in npz.items():
+        try:
+            assert hub.size(f"hub:lane/{method}") == len(whole)
+        except UsageError as error:
+            assert f"hub:lane/{method} is damaged" in str(error)
+
+
+def test_a_new_policy_leaves_the_others_of_its_task_as_they_are(empty_hub: pathlib.Path):
+    shutil.copytree(WITH_THE_PACKAGE, empty_hub)
+    before, facts = {name: hub.about(name) for name in NAMES}, {"episodes": 1}
+    hub.store_facts("hub:ant_2x4/happo", facts)
+    assert {name: hub.about(name) for name in hub.names()} == before | {"hub:ant_2x4/happo": facts}
+    once = hub.file_of("hub:ant_2x4/happo").read_bytes()
+    hub.store_facts("hub:ant_2x4/happo", facts)
+    assert hub.file_of("hub:ant_2x4/happo").read_bytes() == once
 
 
 def test_a_file_that_is_not_of_the_package_is_no_policy(empty_hub: pathlib.Path, cli):
     """Whoever puts a file there may name any task in it, a Python file too."""
     empty_hub.mkdir()
-    np.savez(empty_hub / "lane-mine.npz", config=np.array('task = "mine.py"'), about=np.array("{}"))
+    with zipfile.ZipFile(empty_hub / "lane.zip", "w") as archive, archive.open("mine.npz", "w") as policy:
+        np.savez(policy, config=np.array('task = "mine.py"'), about=np.array("{}"))  # pyright: ignore[reportArgumentType]
     assert "hub:lane/mine is damaged" in cli("eval", "hub:lane/mine")[2]
 
 

@@ -51,7 +51,6 @@ DOORS = {
     "render": ("render", "run", "-o", "x.html"),
     "report": ("report", "run", "-o", "x.html"),
     "init": ("train", "lane", "--init", "run"),
-    "init_fear": ("train", "lane", "--init-fear", "run"),
     "resume": ("train", "run/config.toml", "--out", "run", "--resume"),
     "settings": ("train", "run/config.toml", "--out", "new"),
     "sweep": ("sweep", "run/config.toml", "--set", "clip=0.1,0.2", "--out", "swept"),

@@ -57,39 +57,6 @@ def test_networks_and_moments_are_the_other_runs_and_all_else_is_new(whole: path
         chex.assert_trees_all_equal(getattr(state, name), getattr(fresh, name))
 
 
-def random(x: jax.Array) -> jax.Array:
-    return jnp.asarray(np.random.default_rng(x.size).normal(size=x.shape), x.dtype)
-
-
-@pytest.mark.full
-def test_fear_alone_goes_to_another_team(monkeypatch: pytest.MonkeyPatch):
-    source, learned = first("ant_2x4")
-    assert learned.fear
-    learned = jax.tree.map(lambda x: random(x) if x.dtype == jnp.float32 else x, learned)
-    monkeypatch.setattr(warm_start, "load_run", lambda folder: (source, learned))
-    setup, fresh = first("ant_4x2", init_fear="another run")
-    state = started(setup, fresh)
-    assert state.fear and learned.fear
-    chex.assert_trees_all_equal((state.actor, state.critic.net), (fresh.actor, fresh.critic.net))
-    rows = jax.random.normal(jax.random.key(0), (5, source.vector.spec.state_dim))
-    two, four = (
-        nets.fear(jax.tree.map(lambda x: x[0], fear.params), rows)[..., 0]
-        for nets, fear in ((source.nets, learned.fear), (setup.nets, state.fear))
-    )
-    np.testing.assert_allclose(four, jnp.repeat(two.mean(-1, keepdims=True), 4, axis=-1), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("ours", ["f4sg", "f4sg_letter"])
-def test_a_fear_network_of_each_agent_goes_to_no_other_team(ours: str, monkeypatch: pytest.MonkeyPatch):
-    theirs, learned = first(method="f4sg_letter", env=(("num_agents", 3),))
-    monkeypatch.setattr(warm_start, "load_run", lambda folder: (theirs, learned))
-    setup, _ = first(method=ours, init_fear="other")
-    with pytest.raises(
-        UsageError, match="other has a fear network for each of its 3 agents; init_fear needs a run of 2"
-    ):
-        warm_start.prepare(setup)
-
-
 def test_a_pretrained_policy_brings_what_acts():
     setup, fresh = first("ant_2x4", hidden=(128, 128), init="hub:ant_2x4/f4sg")
     state, (_, pretrained) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))
@@ -122,8 +89,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
     [
         ({"init": "nowhere"}, "nowhere is not a run folder"),
         ({"init": "{whole}", "hidden": "16"}, "actor of {whole} has other shapes than this run's"),
-        ({"init_fear": "{whole}", "method": "mappo_l"}, "init_fear is for methods with a fear network"),
-        ({"init_fear": "hub:ant_2x4/f4sg"}, "hub:ant_2x4/f4sg has no fear network"),
+        ({"init": "{whole}", "method": "f4sg_letter"}, "fear of {whole} has other shapes than this run's"),
     ],
 )
 def test_mistakes(changes: dict[str, object], said: str, whole: pathlib.Path):

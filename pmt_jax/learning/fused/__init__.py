@@ -118,7 +118,7 @@ def _call(which: int, results: Sequence[Any], **options: Any) -> Callable[..., A
 def apply(module: MLP, params: Params, x: jax.Array, through: bool = False) -> jax.Array:
     """As `module.apply`: x [..., I] to [..., O]. Weights have a gradient, x if `through`, and no second one."""
     layers, last = params["params"], len(module.hidden)
-    if last >= MOST_LAYERS or (gpu.available() and not gpu.takes(module, x.shape[-1])):
+    if last >= MOST_LAYERS or (gpu.available() and (through or not gpu.takes(module, x.shape[-1]))):
         return module.apply(params, x)  # pyright: ignore[reportReturnType] (flax types apply as Any or a tuple)
     if gpu.available():
         return gpu.apply(module, params, x)
