@@ -88,7 +88,7 @@ def _compact(log: RunLog, points: int) -> Run:
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
     the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost's curve, whose
-    points count alike, and what the last evaluation found.
+    points count alike, and what the last evaluation found, the one that ended the run if there was one.
     """
     found, (row,) = log.thinned(points), rows([log])
     scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
@@ -98,6 +98,7 @@ def _compact(log: RunLog, points: int) -> Run:
     if evaluated.any():
         last = np.flatnonzero(evaluated)[-1]
         scores |= {f"{OF_MEAN_ACTIONS}{x}": log.metrics[f"eval/episode_{x}"][:, last] for x in ("cost", "reward")}
+    scores |= {f"{OF_MEAN_ACTIONS}{x}": row.deployed[x] for x in ("cost", "reward") if x in row.deployed}
     names = [name for name in (*CURVES, *TRUE_CURVES) if name in found.metrics]
     kept = (*DIAGNOSTICS, *(f"info/{name}" for name in columns(found.task)))
     diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(kept)}

@@ -31,6 +31,7 @@ from pmt_jax.policies import hub
 from pmt_jax.studies import points, table
 from pmt_jax.studies.rows import rows
 from pmt_jax.studies.run_log import read_all
+from pmt_jax.training import final
 
 ROOT = pathlib.Path(__file__).parents[2]
 FAKE = """
@@ -526,6 +527,13 @@ def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
     runs.store([run], tmp_path / "run.json")
     line = runs.as_mean_actions(tmp_path / "run.json").splitlines()[2]
     assert line.startswith("| 1 | happo | ") and line.endswith(" | 1 of 2 | 2.00 | 10 |")
+
+    about = {name: rows[0][name] for name in ("task", "method")} | {"step": steps[-1], "cost_limit": 1.0}
+    ended = [about | {"seed": seed, "episode_cost": 3.0 * seed, "episode_reward": 20.0} for seed in range(2)]
+    final.write(run, ended)  # the one that ended the run
+    runs.store([run], tmp_path / "run.json")
+    line = runs.as_mean_actions(tmp_path / "run.json").splitlines()[2]
+    assert line.endswith(" | 1 of 2 | 1.50 | 20 |")
 
 
 def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
