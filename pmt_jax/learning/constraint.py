@@ -179,7 +179,7 @@ def respond(
 ) -> Constraint:
     """One agent's constraint [K] after its policy has changed.
 
-    The letter's multiplier adds the surrogate I of Eq. 16 to its excess. Other methods leave it out: after an update I
+    The letter's multiplier adds I of `surrogate_cost` to its excess. Other methods leave it out: after an update I
     is below 0 however high the cost, so the cost would settle above the limit.
 
     Args:
