@@ -221,6 +221,17 @@ def test_an_update_learns_what_xla_learns(by_xla, task, method):
     assert metrics.keys() == expected[1].keys()
 
 
+@pytest.mark.parametrize(
+    ("architecture", "obstacle", "expected"),
+    [("9.0", None, True), ("12.0", None, True), ("8.0", None, True), ("7.5", None, False), ("9.0", "no NVRTC", False)],
+)
+def test_gpus_without_tf32_or_a_compiler_compute_networks_by_xla(architecture, obstacle, expected, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(tasks.gpu(), "architecture", lambda: architecture)
+    monkeypatch.setattr(tasks.gpu(), "obstacle", lambda: obstacle)
+    assert fused.gpu.available.__wrapped__() is expected
+
+
 CUDA = ["mlp_forward", "mlp_backward", "mlp_gradients", "mlp_sum"]
 
 

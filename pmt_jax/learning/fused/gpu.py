@@ -26,6 +26,7 @@ _ACTIVATIONS = ("relu", "tanh", "elu")  # in the order of networks.cu
 _WIDEST = {1: 512, 4: 128}  # columns of a block's shared memory, by its tiles of rows
 _TILE, _SPLIT = 16, 128  # rows of a tile, and of a share of a gradient
 _THREADS, _GRADIENT_THREADS, _GRADIENT_TILE = 256, 128, 64  # of networks.cu
+_AMPERE = 8.0  # compute capability
 _FULL = 528  # blocks that keep a GPU busy; more of them take more rows each
 
 
@@ -95,8 +96,10 @@ def _begin(sizes: list[int], together: int) -> tuple[list[Any], int]:
 
 @functools.cache
 def available() -> bool:
-    """Whether the default device is an NVIDIA GPU, with NVIDIA's run-time compiler."""
-    return jax.default_backend() == "gpu" and tasks.gpu().obstacle() is None
+    """Whether there are NVIDIA GPUs that multiply in TF32, as from Ampere on, and NVIDIA's run-time compiler."""
+    if jax.default_backend() != "gpu" or tasks.gpu().obstacle() is not None:
+        return False
+    return float(tasks.gpu().architecture()) >= _AMPERE
 
 
 def takes(module: MLP, inputs: int) -> bool:
