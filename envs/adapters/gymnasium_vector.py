@@ -26,7 +26,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
     """See `adapters.to_gymnasium`."""
 
     def __init__(self, env: Env, num_envs: int, seed: int, autoreset_mode: AutoresetMode | str) -> None:
-        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
         self._mode = AutoresetMode(one_of("autoreset_mode", mode, [x.value for x in MODES]))
         self.metadata = {"autoreset_mode": self._mode}
         self.num_envs = count("num_envs", num_envs)
