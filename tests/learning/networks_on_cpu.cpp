@@ -113,8 +113,8 @@ extern "C" {
 void forward(int blocks, const float* w, const float* x, float* out, float* saved) {
   launch(blocks, THREADS, [=] { mlp_forward(w, x, out, saved); });
 }
-void backward(int blocks, const float* gradient, const float* w, const float* x, const float* saved, float* deltas) {
-  launch(blocks, THREADS, [=] { mlp_backward(gradient, w, x, saved, deltas); });
+void backward(int blocks, const float* gradient, const float* w, const float* saved, float* deltas) {
+  launch(blocks, THREADS, [=] { mlp_backward(gradient, w, saved, deltas); });
 }
 void gradients(int blocks, const float* gradient, const float* x, const float* saved, const float* deltas, float* out) {
   launch(blocks, GRADIENT_THREADS, [=] { mlp_gradients(gradient, x, saved, deltas, out); });

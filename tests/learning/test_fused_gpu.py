@@ -90,7 +90,7 @@ def test_the_kernels_compute_what_xla_computes(
     weights = np.concatenate([np.asarray(leaf).reshape(NETWORKS, -1) for leaf in jax.tree.leaves(params)], 1)
     out, saved, deltas = array(rows, outputs), array(network.saved(rows)[1]), array(network.deltas(rows)[1])
     shares, gradient = array(-(-rows // gpu._SPLIT), network.weights), array(network.weights)
-    calls = {"forward": (weights, x, out, saved), "backward": (weight, weights, x, saved, deltas)}
+    calls = {"forward": (weights, x, out, saved), "backward": (weight, weights, saved, deltas)}
     calls |= {"gradients": (weight, x, saved, deltas, shares), "sum": (shares, gradient)}
     for (name, arrays), count in zip(calls.items(), blocks, strict=True):
         held = [np.ascontiguousarray(each, np.float32) if isinstance(each, jax.Array) else each for each in arrays]

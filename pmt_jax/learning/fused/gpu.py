@@ -143,7 +143,7 @@ def _forward(network: _Network, weights: jax.Array, x: jax.Array) -> tuple[jax.A
 
 def _backward(network: _Network, kept: Any, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
     weights, x, saved = kept
-    (deltas,) = _kernel(network, x.shape[0], True, "BACKWARD")(gradient, weights, x, saved)
+    (deltas,) = _kernel(network, x.shape[0], True, "BACKWARD")(gradient, weights, saved)
     (shares,) = _kernel(network, x.shape[0], True, "WEIGHT_GRADIENTS")(gradient, x, saved, deltas)
     (total,) = _kernel(network, x.shape[0], True, "SUM")(shares)
     return total, jnp.zeros_like(x)

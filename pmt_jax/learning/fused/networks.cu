@@ -213,7 +213,7 @@ template <int L> __device__ void normalise_back(const Rows& rows, const float* w
   }
 }
 
-template <int L> __device__ void backward_to(const Rows& rows, const float* w, const float* x, const float* saved, float* deltas) {
+template <int L> __device__ void backward_to(const Rows& rows, const float* w, const float* saved, float* deltas) {
   if constexpr (L > 0 || INPUT_NORM) {
     constexpr int in = WIDTH[L], width = WIDTH[L + 1];
     RowsProduct<in> product;
@@ -241,28 +241,28 @@ template <int L> __device__ void backward_to(const Rows& rows, const float* w, c
         if (rows.real(row)) deltas[DELTA_AT[L - 1] + at] = rows.tile[row][j] *= slope(active[at]);
       }
       __syncthreads();
-      backward_to<L - 1>(rows, w, x, saved, deltas);
+      backward_to<L - 1>(rows, w, saved, deltas);
     }
   }
 }
 
-// The gradient of the outputs [R, O], weights [P], x and what the forward pass saved to the gradients of what each
+// The gradient of the outputs [R, O], weights [P] and what the forward pass saved to the gradients of what each
 // layer and norm gives.
 #ifdef BACKWARD
 extern "C" __global__ void __launch_bounds__(THREADS)
-mlp_backward(const float* __restrict__ gradient, const float* __restrict__ w, const float* __restrict__ x,
-             const float* __restrict__ saved, float* __restrict__ deltas) {
+mlp_backward(const float* __restrict__ gradient, const float* __restrict__ w, const float* __restrict__ saved,
+             float* __restrict__ deltas) {
   __shared__ float tile[TAKEN][PITCH];
   constexpr int width = WIDTH[LAYERS];
   const long n = blockIdx.x / BLOCKS;
   const Rows rows = {tile, int(blockIdx.x % BLOCKS) * TAKEN};
-  gradient += n * ROWS * width, w += n * WEIGHTS, x += n * ROWS * WIDTH[0], saved += n * SAVED, deltas += n * DELTAS;
+  gradient += n * ROWS * width, w += n * WEIGHTS, saved += n * SAVED, deltas += n * DELTAS;
   for (int k = threadIdx.x; k < TAKEN * width; k += THREADS) {
     const int row = k / width, j = k % width;
     tile[row][j] = rows.real(row) ? gradient[long(rows.first + row) * width + j] : 0;
   }
   __syncthreads();
-  backward_to<LAYERS - 1>(rows, w, x, saved, deltas);
+  backward_to<LAYERS - 1>(rows, w, saved, deltas);
 }
 #endif
 
