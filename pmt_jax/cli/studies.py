@@ -104,7 +104,7 @@ def _add_reproduce(commands: Any) -> None:
         "--budget",
         default="smoke",
         metavar="WORD",
-        help="smoke (default): minutes, to see that everything runs | paper: 5 seeds, all steps; days on a CPU",
+        help="smoke (default): minutes, to see that everything runs | paper: all steps and seeds; days on a CPU",
     )
     reproduce.add_argument(
         "--out", type=path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
