@@ -399,8 +399,11 @@ def test_a_networks_kernels_compute_what_xla_computes(shape, float32_products):
     )
     np.testing.assert_allclose(out, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
     largest = max(np.abs(z).max() for z in jax.tree.leaves(exactly))
-    for found, right in zip(jax.tree.leaves(gradient), jax.tree.leaves(exactly), strict=True):
-        np.testing.assert_allclose(found, right, rtol=0, atol=5e-5 * largest)
+    errors = [np.abs(x - y) for x, y in zip(jax.tree.leaves(gradient), jax.tree.leaves(exactly), strict=True)]
+    errors = np.concatenate([np.ravel(error) for error in errors]) / largest
+    # A unit of relu whose input is 0 but for rounding may be on for one and off for the other, in one row of many.
+    allowed = 1e-3 if "relu" in about else 5e-5
+    assert errors.max() <= allowed and np.quantile(errors, 0.99) <= 5e-5
     stacked = jax.tree.map(lambda x: jnp.stack([1.1 * x, x]), params)
     beside = jax.jit(jax.vmap(functools.partial(fused.apply, module), (0, None)))(stacked, jnp.asarray(x))[1]
     assert same(beside, jax.jit(functools.partial(fused.apply, module))(params, jnp.asarray(x)))

@@ -164,7 +164,7 @@ def as_paper(file: pathlib.Path) -> str:
 
 def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
-    cells = _summaries(files)
+    cells = {(task, row.method): (row, text) for (task, _), (row, text) in _summaries(files).items()}
     tasks, methods = (list(dict.fromkeys(name)) for name in zip(*cells, strict=True))
     limits = {row.task: row.limits for row, _ in cells.values()}
     head = ["", *(f"`{task}` (limit {limits[task]})" for task in tasks)]
@@ -301,12 +301,16 @@ def as_points(file: pathlib.Path) -> str:
 
 
 def as_mean_actions(file: pathlib.Path) -> str:
-    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions."""
-    found = sorted(load(file), key=lambda run: (run["cost_limit"], run["label"]))
+    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions.
+
+    A + joins the names of several files.
+    """
+    stored = [run for name in file.stem.split("+") for run in load(file.with_stem(name))]
+    found = sorted(stored, key=lambda run: (run["cost_limit"], list(METHODS).index(run["method"])))
     body = []
     for run in found:
         limit = f"{run['cost_limit']:g}"
-        line = [limit, run["label"].replace(f" cost_limit={limit}", "")]
+        line = [limit, run["method"]]
         for source in ("", OF_MEAN_ACTIONS):
             cost, reward = (np.array(run["table"][source + name], float) for name in ("cost", "reward"))
             line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.0f}"]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import pathlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pmt_jax.formats import markdown
-from pmt_jax.studies.statistics import holm, u_test
+from pmt_jax.studies.statistics import difference_interval, holm, welch_test
 
 from . import runs
 
@@ -47,56 +47,51 @@ def unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
     return f"{(own['end'] > run['cost_limit'] / share(run)).sum()} of {len(own['end'])}"
 
 
-def as_probe(file: pathlib.Path) -> str:
-    """Probes of F4SG against MAPPO-L with the same settings, at the same p and limit.
+def as_probe(files: pathlib.Path) -> str:
+    """F4SG against MAPPO-L at the same probability and limit of true costs; a + joins the names of several files.
 
-    p of each comparison is corrected over all comparisons of the file, those of the three measures together.
+    The tests are Welch's, corrected by Holm over the three measures of all pairs together. d is Cohen's.
     """
-    found = sorted(runs.load(file), key=lambda run: (share(run), -_limit(run), _recipe(run), _rank(run)))
+    stored = [run for name in files.stem.split("+") for run in runs.load(files.with_stem(name))]
+    found = sorted((run for run in stored if run["method"] in PAIR), key=lambda run: (*_cell(run), _rank(run)))
     scores = [measures(run) for run in found]
-    pairs = [(i, j) for j, run in enumerate(found) if (i := _same_settings(found, run)) is not None]
+    pairs = [j for j in range(1, len(found)) if _cell(found[j]) == _cell(found[j - 1])]  # F4SG's row, after its other
     order = ("training", "end", "reward")
-    p = holm([u_test(scores[j][name], scores[i][name]) for i, j in pairs for name in order])
-    corrected = {j: p[3 * k : 3 * k + 3] for k, (_, j) in enumerate(pairs)}
+    p = holm([welch_test(scores[j][name], scores[j - 1][name]) for j in pairs for name in order])
+    corrected = {j: ", ".join(map(p_value, p[3 * k : 3 * k + 3])) for k, j in enumerate(pairs)}
     body = []
     for j, (run, own) in enumerate(zip(found, scores, strict=True)):
-        line = [f"{share(run):g}", f"{_limit(run):g}", f"{NAMES[run['method']]}, {RECIPES[_recipe(run)]}"]
-        line += [mean_sd(own["training"]), mean_sd(own["end"]), f"{np.median(own['end']):.1f}", mean_sd(own["reward"])]
-        body.append([*line, unsafe(run, own), ", ".join(map(p_value, corrected[j])) if j in corrected else "-"])
-    head = ["p", "limit", "method, settings", "true cost per 1,000 steps, training", "true cost at the end", "median"]
-    return markdown([*head, "reward", "seeds beyond the limit", "corrected p: training, end, reward"], body)
+        line = [f"{share(run):g}", f"{_limit(run):g}", NAMES[run["method"]], *(mean_sd(own[name]) for name in order)]
+        compared = (_effect(own["training"], scores[j - 1]["training"]), corrected[j]) if j in corrected else ("-", "-")
+        body.append([*line, unsafe(run, own), *compared])
+    head = ["p", "limit", "method", "harm: costly steps per 1,000, training", "true cost at the end", "reward"]
+    head += ["seeds beyond the limit", "harm less MAPPO-L's [95 %], d", "corrected p: harm, cost, reward"]
+    return markdown(head, body)
 
 
-RECIPES = (
-    "as in the study",
-    "`max_grad_norm` inf",
-    "`cost_value_clip` inf",
-    "`cost_value_clip` and `max_grad_norm` inf",
-    "PID for tight limits",
-)
+PAIR = ("mappo_l", "f4sg")
 
 
-def _recipe(run: runs.Run) -> int:
-    """Which of RECIPES the run has."""
-    mine = settings(run)
-    uncut, unclipped = (np.isinf(mine[name]) for name in ("max_grad_norm", "cost_value_clip"))
-    return 4 if mine["lambda_rule"] == "pid" else 2 * int(unclipped) + int(uncut)
+def _cell(run: runs.Run) -> tuple[float, float]:
+    """What F4SG and MAPPO-L have in common if they are compared."""
+    return share(run), -_limit(run)
+
+
+def _effect(ours: Scores, theirs: Scores) -> str:
+    """The difference of the means with its 95 % interval, and in standard deviations."""
+    low, high = difference_interval(ours, theirs)
+    difference = ours.mean() - theirs.mean()
+    spread = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 2)
+    return f"{difference:.1f} [{low:.1f}, {high:.1f}], {difference / spread if spread else 0:.1f}"
 
 
 def _limit(run: runs.Run) -> float:
     """The limit of true costs: the team notices a share of them."""
-    return run["cost_limit"] / share(run)
+    return round(run["cost_limit"] / share(run), 9)
 
 
 def _rank(run: runs.Run) -> int:
     return list(NAMES).index(run["method"])
-
-
-def _same_settings(found: Sequence[runs.Run], run: runs.Run) -> int | None:
-    """Where the MAPPO-L is that an F4SG is compared with."""
-    wanted = "mappo_l", share(run), _limit(run), _recipe(run)
-    like = [i for i, x in enumerate(found) if (x["method"], share(x), _limit(x), _recipe(x)) == wanted]
-    return like[0] if like and run["method"] == "f4sg" else None
 
 
 def as_weights(file: pathlib.Path) -> str:

@@ -31,12 +31,14 @@ FIGURES = {
     "velocity_ant_2x4": "velocity_h200",
     "velocity_half_cheetah_2x3": "velocity_h200",
     "grid_33": "table3_voltage_33_h200",
+    "harm": "fear_ant_2x4_h200",
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
 GRID_PANELS = {  # Fig. 3 of the paper
     "info/totally_controllable_ratio": "CR, share of steps in the band",
     "info/total_line_loss": "PL, power lost in lines (MW)",
 }
+HARM_PANELS = {"true_step_cost": "share of steps that cost, noticed or not", "episode_reward": "reward of an episode"}
 
 
 def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] = PANELS) -> None:
@@ -45,7 +47,10 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
         figure = Figure(figsize=(10, 4.2), layout="constrained")
         for axis, (name, title) in zip(figure.subplots(1, 2), panels.items(), strict=True):
             last = max(int(run.steps[-1]) for group in shown for run in group.runs)
-            ends = [_line(axis, group, name, last, banded=len(shown) <= plot.MOST_BANDS) for group in shown]
+            ends = [
+                _line(axis, group, name, last, banded=len(shown) <= plot.MOST_BANDS, pid=_pid_beside_none(group, shown))
+                for group in shown
+            ]
             style.over_steps(axis, title, last)
             if name == "episode_cost":
                 plot.cost_axis(axis, shown, name)
@@ -60,12 +65,17 @@ def draw(shown: Sequence[Group], file: pathlib.Path, panels: Mapping[str, str] =
         figure.savefig(file, dpi=110)
 
 
-def _line(axis: Any, group: Group, name: str, last: int, banded: bool) -> tuple[str, float]:
+def _pid_beside_none(group: Group, shown: Sequence[Group]) -> bool:
+    """Whether its multiplier has PID and that of another group of the same method has not."""
+    pid = {runs.has_pid(other.method, other.runs[0].settings) for other in shown if other.method == group.method}
+    return len(pid) == 2 and runs.has_pid(group.method, group.runs[0].settings)
+
+
+def _line(axis: Any, group: Group, name: str, last: int, banded: bool, pid: bool) -> tuple[str, float]:
     """Draws a method's mean over seeds, dotted to the `last` step if it stopped early; returns its name and end.
 
-    A PID multiplier has dashes.
+    With dashes if its multiplier has PID and the same method without has a line, too.
     """
-    pid = runs.has_pid(group.method, group.runs[0].settings)
     steps, values = plot.curve(group, name)
     known = np.isfinite(values).any(0)
     low, mean, high = (f(values[:, known], axis=0) for f in (np.nanmin, np.nanmean, np.nanmax))
@@ -83,7 +93,7 @@ def main(names: list[str]) -> None:
     for name in names or FIGURES:
         found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
         found = [run for run in found if run["task"] == name] or found  # a file of several tasks
-        panels = GRID_PANELS if name.startswith("grid") else PANELS
+        panels = {"grid_33": GRID_PANELS, "harm": HARM_PANELS}.get(name, PANELS)
         draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png", panels)
         print(f"docs/{name}.png")
 

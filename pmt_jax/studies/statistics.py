@@ -153,6 +153,13 @@ def u_test(ours: ArrayLike, theirs: ArrayLike) -> float:
     return float(scipy.stats.mannwhitneyu(ours, theirs).pvalue)
 
 
+def welch_test(ours: ArrayLike, theirs: ArrayLike) -> float:
+    """The two-sided p of Welch's t test, of means of unequal variances; scores [seeds] that all agree have p 0 or 1."""
+    if not np.ptp(ours) and not np.ptp(theirs):
+        return float(np.mean(ours) == np.mean(theirs))
+    return float(scipy.stats.ttest_ind(ours, theirs, equal_var=False).pvalue)
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """p values corrected for their number by Holm's step-down method, in the order given."""
     order = np.argsort(p_values)

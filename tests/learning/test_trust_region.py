@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax.learning.trust_region import backtrack, conjugate_gradient, constrained_direction, solve
+from pmt_jax.learning.maths import distributions
+from pmt_jax.learning.trust_region import (
+    DAMPING,
+    backtrack,
+    conjugate_gradient,
+    constrained_direction,
+    fisher,
+    solve,
+)
 
 G = jnp.asarray([-1.0, 0.0])
 
@@ -28,6 +36,24 @@ def test_direction(c: float, b: tuple[float, float], step: tuple[float, float], 
     direction = constrained_direction(G, jnp.asarray(b, float), jnp.asarray(c, float), lambda v: v, 0.5)
     np.testing.assert_allclose(direction.step, step, atol=2e-4)
     assert direction.case == case
+
+
+def test_the_fisher_matrix_is_the_hessian_of_the_divergence():
+    obs, mask = jax.random.normal(jax.random.key(0), (20, 3)), jnp.asarray([1.0, 0.0]).repeat(10)[:, None]
+    start = jax.random.normal(jax.random.key(1), (10,))
+
+    def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean = jnp.tanh(obs @ flat[:6].reshape(3, 2)) @ flat[6:8, None]
+        return mean, jnp.broadcast_to(jnp.exp(flat[8:9]), mean.shape)
+
+    outputs = policy(start)
+
+    def divergence(mean: jax.Array, std: jax.Array) -> jax.Array:
+        return distributions.kl(*outputs, mean, std, mask).mean()
+
+    hessian = jax.hessian(lambda flat: divergence(*policy(flat)))(start) + DAMPING * jnp.eye(10)
+    columns = jax.vmap(fisher(policy, divergence, start), out_axes=1)(jnp.eye(10))
+    np.testing.assert_allclose(columns, hessian, atol=1e-5)
 
 
 def exact(g: np.ndarray, b: np.ndarray, c: float, h: np.ndarray, delta: float) -> np.ndarray | None:

@@ -92,6 +92,14 @@ def test_the_u_test_by_hand():
     assert statistics.u_test([1, 1], [1, 1]) == 1
 
 
+def test_welchs_test_agrees_with_its_interval():
+    """An interval of 1 - p ends at 0."""
+    x, y = np.array([1.0, 2, 4, 8]), np.array([5.0, 6, 6, 9, 11])
+    low, high = statistics.difference_interval(x, y, 1 - statistics.welch_test(x, y))
+    assert min(abs(low), abs(high)) < 1e-6
+    assert statistics.welch_test([1, 1], [1, 1]) == 1 and statistics.welch_test([1, 1], [2, 2]) == 0
+
+
 def test_holms_correction_by_hand():
     np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03, 0.5]), [0.04, 0.09, 0.09, 0.5])
     assert statistics.holm([0.6, 0.7]) == [1, 1] and statistics.holm([]) == []
