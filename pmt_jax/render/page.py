@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import importlib.resources
 import json
@@ -12,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from ..studies import plot
-from .encode import to_base64
 from .episode import Episode
 
 NUMBER = re.compile(r"[-+]?(\d|$)")  # the beginning of one, or - for none
@@ -35,6 +35,11 @@ def page(title: str, body: Iterable[str]) -> str:
 
 def _asset(name: str) -> str:
     return importlib.resources.files("pmt_jax").joinpath("render", "assets", name).read_text()
+
+
+def to_base64(x: np.ndarray) -> str:
+    """Numbers for the page's script: bytes as they are, everything else as little-endian f32."""
+    return base64.b64encode(np.ascontiguousarray(x, "u1" if x.dtype == np.uint8 else "<f4").tobytes()).decode()
 
 
 def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
