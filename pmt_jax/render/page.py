@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import importlib.resources
 import json
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..studies import plot
-from .episode import Episode
+from .episode import Episode, to_base64
 
 NUMBER = re.compile(r"[-+]?(\d|$)")  # the beginning of one, or - for none
 RATE = 20.0  # control steps that a replay shows a second
@@ -35,11 +34,6 @@ def page(title: str, body: Iterable[str]) -> str:
 
 def _asset(name: str) -> str:
     return importlib.resources.files("pmt_jax").joinpath("render", "assets", name).read_text()
-
-
-def to_base64(x: np.ndarray) -> str:
-    """Numbers for the page's script: bytes as they are, everything else as little-endian f32."""
-    return base64.b64encode(np.ascontiguousarray(x, "u1" if x.dtype == np.uint8 else "<f4").tobytes()).decode()
 
 
 def replay(episode: Episode, rate: float = RATE, play: bool = True) -> str:
