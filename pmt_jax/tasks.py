@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import pathlib
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .errors import UsageError
@@ -58,6 +58,20 @@ def _envs() -> types.ModuleType:
     return envs
 
 
+def _module(name: str) -> Any:
+    return importlib.import_module(f"{_envs().__name__}.{name}")
+
+
+@contextlib.contextmanager
+def _asked() -> Iterator[Any]:
+    """Gives `envs`, whose errors become sentences of ours."""
+    envs = _envs()
+    try:
+        yield envs
+    except envs.TaskError as error:
+        raise UsageError(str(error)) from error
+
+
 _CONTRACT = {"Env": "base", "EnvSpec": "base", "State": "base", "declarations": "base"}
 _CONTRACT |= {"shares_cost": "base"}
 _CONTRACT |= {"Outcome": "vector", "VectorEnv": "vector", "VectorState": "vector", "observed_cost": "vector"}
@@ -67,7 +81,7 @@ def __getattr__(name: str) -> Any:
     """The contract's types and functions, imported (with JAX) when first asked for."""
     if name not in _CONTRACT:
         raise AttributeError(f"module 'pmt_jax.tasks' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{_envs().__name__}.{_CONTRACT[name]}"), name)
+    return getattr(_module(_CONTRACT[name]), name)
 
 
 def names() -> list[str]:
@@ -91,11 +105,8 @@ def members(name: str) -> tuple[dict[str, Any], str | None]:
     Raises:
       UsageError: there is no such file, or it cannot be imported.
     """
-    envs = _envs()
-    try:
+    with _asked() as envs:
         return envs.user.members(name)
-    except envs.TaskError as error:
-        raise UsageError(str(error)) from error
 
 
 def absolute(name: str) -> str:
@@ -114,7 +125,7 @@ def baseline(env: Env, name: str) -> Controller:
     Raises:
       UsageError: unknown policy, or a task that has none.
     """
-    known = importlib.import_module(f"{_envs().__name__}.base").declarations(env).baselines
+    known = _module("base").declarations(env).baselines
     if not known:
         raise UsageError(f"task '{env.spec.name}' has no baseline policies")
     if name not in known:
@@ -129,7 +140,7 @@ def columns(name: str) -> Mapping[str, Column]:
 
 def installed_version(package: str) -> str | None:
     """A package's version; None where it is missing."""
-    return importlib.import_module(f"{_envs().__name__}.versions").installed_version(package)
+    return _module("versions").installed_version(package)
 
 
 def engines(env: Env | None = None) -> tuple[str, dict[str, str | None]]:
@@ -140,49 +151,42 @@ def engines(env: Env | None = None) -> tuple[str, dict[str, str | None]]:
     Raises:
       UsageError: MuJoCo is missing or of another version.
     """
-    package = _envs()
-    try:
-        physics = importlib.import_module(f"{package.__name__}.physics")
+    with _asked():
+        physics = _module("physics")
         physics.check_versions()
         model = _model(env)
         return physics.resolve("auto", model), {name: physics.obstacle(name, model) for name in physics.ENGINES}
-    except package.TaskError as error:
-        raise UsageError(str(error)) from error
 
 
 def _model(env: Env | None) -> Any:
     """The MjModel that a task's physics steps, as far as the task declares one."""
-    return (
-        getattr(importlib.import_module(f"{_envs().__name__}.base").declarations(env).picture, "model", None)
-        if env is not None
-        else None
-    )
+    return None if env is None else getattr(_module("base").declarations(env).picture, "model", None)
 
 
 def advice(env: Env) -> str | None:
     """What would make a task's physics faster on this machine, as a sentence; None if nothing is known."""
     model = _model(env)
-    return importlib.import_module(f"{_envs().__name__}.physics").advice(model) if model is not None else None
+    return _module("physics").advice(model) if model is not None else None
 
 
 def compiler() -> str:
     """What compiles the engine `fused` here; needs one."""
-    return importlib.import_module(f"{_envs().__name__}.physics.fused_engine").compiler()
+    return _module("physics.fused_engine").compiler()
 
 
 def native() -> types.ModuleType:
     """How C++ code is compiled and called here."""
-    return importlib.import_module(f"{_envs().__name__}.native")
+    return _module("native")
 
 
 def gpu() -> types.ModuleType:
     """How CUDA code is compiled and called here."""
-    return importlib.import_module(f"{_envs().__name__}.physics.fused.gpu")
+    return _module("physics.fused.gpu")
 
 
 def announcing(say: Callable[[str], object]) -> contextlib.AbstractContextManager[None]:
     """Prints a line before something that takes long while a task is made inside."""
-    return importlib.import_module(f"{_envs().__name__}.progress").announcing(say)
+    return _module("progress").announcing(say)
 
 
 def make(name: str, physics: str = "auto", **options: Any) -> Env:
@@ -191,13 +195,13 @@ def make(name: str, physics: str = "auto", **options: Any) -> Env:
     Raises:
       UsageError: unknown task or option, an engine that cannot run here, or a file that does not keep the contract.
     """
-    envs = _envs()
+    if physics != "auto":
+        options["physics"] = physics
     try:
-        if physics != "auto":
-            options["physics"] = physics
-        return envs.make(name, **options)
-    except envs.TaskError as error:
-        raise UsageError(str(error)) from error
+        with _asked() as envs:
+            return envs.make(name, **options)
+    except UsageError:
+        raise
     except Exception as error:
         given = ", ".join(f"{option} = {value!r}" for option, value in options.items() if option != "physics")
         if not given:
@@ -212,11 +216,8 @@ def check(env: Env) -> None:
     Raises:
       UsageError: it does not keep the contract of envs/base.py.
     """
-    envs = _envs()
-    try:
+    with _asked() as envs:
         envs.user.check_shapes(env, type(env).__name__)
-    except envs.TaskError as error:
-        raise UsageError(str(error)) from error
 
 
 def options(name: str) -> dict[str, Any]:
@@ -225,11 +226,8 @@ def options(name: str) -> dict[str, Any]:
     Raises:
       UsageError: unknown task.
     """
-    envs = _envs()
-    try:
+    with _asked() as envs:
         return envs.task_options(name)
-    except envs.TaskError as error:
-        raise UsageError(str(error)) from error
 
 
 def explain_options(name: str) -> str:

@@ -17,8 +17,7 @@ import numpy as np
 
 from .. import native
 from ..errors import at_least
-from .batching import flattened
-from .contract import PhysicsState, Readout, Remade, rest_state, usable_cpus
+from .contract import PhysicsState, Readout, Remade, flattened, rest_state, usable_cpus
 from .fused import cpu, gpu
 from .fused.model import FIELDS, tables
 

@@ -16,8 +16,7 @@ import mujoco
 import numpy as np
 
 from . import warp_kernels
-from .batching import flattened
-from .contract import PhysicsState, Readout, Remade, needs_post_constraint, rest_state
+from .contract import PhysicsState, Readout, Remade, flattened, needs_post_constraint, rest_state
 from .mjx_patches import import_mjx
 
 

@@ -66,12 +66,12 @@ def add(commands: Any) -> None:
 @interruptible()
 def run(arguments: argparse.Namespace) -> int:
     """Trains as the arguments say."""
+    config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
+    if arguments.resume and arguments.out is None:
+        raise UsageError("--resume needs --out, the folder of the run to continue")
+    if arguments.change and not arguments.resume:
+        raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
     with trusting(arguments.trust):
-        config = load_config(arguments.source, preset=arguments.preset, **given(arguments))
-        if arguments.resume and arguments.out is None:
-            raise UsageError("--resume needs --out, the folder of the run to continue")
-        if arguments.change and not arguments.resume:
-            raise UsageError("--change belongs to --resume; without it the settings are those of a new run")
         check_source(arguments.source, [config.task, config.method], [arguments.set_method or ""])
         if arguments.verbose:
             logging.getLogger("envs").setLevel(logging.INFO)

@@ -1,12 +1,13 @@
-"""Where settings come from: files in configs/ and of the user's own, presets, keywords and words of a command line.
+"""Where settings come from: tables in configs/, files of the user's own, presets, keywords and words of a command line.
 
-A file in `configs/` holds what all methods of a task share, then a `[method.NAME]` table of what differs; it may begin
-with the settings of another: `extends = "NAME"`.
+The settings of a task are what all methods share, then a `[method.NAME]` table of what differs. They may begin with
+those of another: `extends = "NAME"`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import pathlib
 import shlex
@@ -23,7 +24,6 @@ from .settings import FIELDS, Config
 
 _PACKAGE = pathlib.Path(__file__).parents[1]
 CONFIG_DIR = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
-_PRESETS = CONFIG_DIR / "presets.toml"
 
 Table = dict[str, Any]
 
@@ -39,7 +39,7 @@ def load_config(
     A task's own options (`env`) are laid over each other one by one.
 
     Args:
-      source: a name in configs/ (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
+      source: a name in `names()` (`lane`, `paper/ant_2x4`), the path of a TOML file (a run's own config.toml included),
         a Python file with an environment of your own (`my_env.py`, `my_env.py:Name`), or what such a file holds.
       method: a name in METHODS, or a Python file with a row of your own (`my_methods.py:dread`); the file's own choice
         if None.
@@ -102,25 +102,36 @@ def to_toml(config: Config) -> str:
 # Files
 
 
+@functools.cache
+def _packaged() -> dict[str, Table]:
+    """The configurations that come with the package, by name: tables of tasks.toml, and `paper/TASK` of paper.toml."""
+    tasks = {name: {"task": name, **table} for name, table in _parse(CONFIG_DIR / "tasks.toml").items()}
+    paper = _parse(CONFIG_DIR / "paper.toml").items()
+    return tasks | {f"paper/{name}": {"extends": name, **table} for name, table in paper}
+
+
+@functools.cache
+def _presets() -> dict[str, Table]:
+    return _parse(CONFIG_DIR / "presets.toml")
+
+
 def names() -> list[str]:
-    """The configurations that come with the package, each named by its path in configs/: `lane`, `paper/ant_2x4`."""
-    files = set(CONFIG_DIR.rglob("*.toml")) - {_PRESETS}
-    return sorted(path.relative_to(CONFIG_DIR).with_suffix("").as_posix() for path in files)
+    """The configurations that come with the package: `lane`, `paper/ant_2x4`, ..."""
+    return sorted(_packaged())
 
 
 def presets() -> dict[str, str]:
     """What can be laid over any configuration: {name: one sentence about it}."""
-    return {name: str(table["about"]) for name, table in _parse(_PRESETS).items()}
+    return {name: str(table["about"]) for name, table in _presets().items()}
 
 
 def about(name: str) -> str:
-    """The sentence in which a file of configs/ describes itself; '' if it has none."""
-    path = CONFIG_DIR / f"{name}.toml"
-    return str(_parse(path).get("about", "")) if path.is_file() else ""
+    """The sentence in which a configuration of the package describes itself; '' if there is none of that name."""
+    return str(_packaged().get(name, {}).get("about", ""))
 
 
 def read(source: str | pathlib.Path) -> Table:
-    """The settings of a file, laid over those of the file that it `extends`.
+    """Settings, laid over those that they `extend`.
 
     Args:
       source: one of `names()`, or the path of a TOML file.
@@ -128,7 +139,10 @@ def read(source: str | pathlib.Path) -> Table:
     Raises:
       UsageError: no such file, or one that is not valid.
     """
-    return _resolve(_find(str(source)), ())
+    source = str(source)
+    if source not in _packaged() and not source.endswith(".toml") and not os.path.isfile(source):
+        _refuse(source)
+    return _resolve(source, ())
 
 
 def read_preset(name: str) -> Table:
@@ -137,7 +151,7 @@ def read_preset(name: str) -> Table:
     Raises:
       UsageError: there is none of that name.
     """
-    tables = _parse(_PRESETS)
+    tables = _presets()
     if name not in tables:
         raise UsageError(f"unknown preset '{name}'{did_you_mean(name, tables)}")
     return {key: value for key, value in tables[name].items() if key != "about"}
@@ -148,33 +162,29 @@ def resume_command(out: str) -> str:
     return shlex.join(["pmt", "train", os.path.join(out, "config.toml"), "--out", out, "--resume"])
 
 
-def _find(source: str) -> pathlib.Path:
-    known = names()
-    if source in known:
-        return CONFIG_DIR / f"{source}.toml"
-    if source.endswith(".toml") or os.path.isfile(source):
-        return pathlib.Path(source)
+def _refuse(source: str) -> typing.NoReturn:
     if os.path.isfile(settings := os.path.join(source, "config.toml")):
         again = resume_command(source)
         raise UsageError(f"{source} is a run folder; its settings are {settings}, and this continues it: {again}")
-    raise UsageError(f"unknown task '{source}'{did_you_mean(source, known)} (pmt envs lists all)")
+    raise UsageError(f"unknown task '{source}'{did_you_mean(source, names())} (pmt envs lists all)")
 
 
-def _resolve(path: pathlib.Path, below: tuple[pathlib.Path, ...]) -> Table:
-    """A file's settings; `below` are the files that it was reached from by `extends`."""
-    table = _parse(path)
+def _resolve(source: str, below: tuple[str, ...]) -> Table:
+    """The settings of a name or a file; `below` are the files that it was reached from by `extends`."""
+    known = _packaged()
+    table = dict(known[source]) if source in known else _parse(pathlib.Path(source))
     table.pop("about", None)
     base = table.pop("extends", None)
     if base is None:
         return table
     if not isinstance(base, str):
-        raise UsageError(f"{path}: 'extends' must be one name in configs/ or one path, not {base!r}")
-    found = CONFIG_DIR / f"{base}.toml" if base in names() else path.parent / base
-    if not found.is_file():
-        raise UsageError(f"{path} extends '{base}', which is not there{did_you_mean(base, names())}")
-    chain = (*below, path.resolve())
-    if found.resolve() in chain:
-        raise UsageError(f"{path} extends '{base}', which extends it in turn")
+        raise UsageError(f"{source}: 'extends' must be one name that pmt envs lists or one path, not {base!r}")
+    found = base if base in known else os.path.join(os.path.dirname(source), base)
+    if found not in known and not os.path.isfile(found):
+        raise UsageError(f"{source} extends '{base}', which is not there{did_you_mean(base, names())}")
+    chain = (*below, os.path.realpath(source))
+    if os.path.realpath(found) in chain:
+        raise UsageError(f"{source} extends '{base}', which extends it in turn")
     return over(_resolve(found, chain), table)
 
 

@@ -118,11 +118,16 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     if found := numerics.obstacle():
         raise UsageError(found)
     method = find(config.method)
-    if env is None:
-        env = tasks.make(config.task, config.physics, **dict(config.env))
-    else:
+    if env is not None:
         tasks.check(env)
-    _check_limits(config, env.spec)
+    else:
+        env = tasks.make(config.task, config.physics, **dict(config.env))
+    count, given = env.spec.num_costs, np.size(config.cost_limit)
+    if given not in (1, count):
+        wanted = "one number" if count == 1 else f"one number, or {count}"
+        raise UsageError(
+            f"cost_limit has {given} numbers, but task '{env.spec.name}' has {count} cost(s); give {wanted}"
+        )
     if method.letter and config.recurrent != "none":
         raise UsageError(
             f"{label(config.method)} has the paper's networks, which remember nothing; leave out recurrent"
@@ -130,10 +135,3 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
     nets = networks.build(config, env.spec, method)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
     return Setup(config, method, vector, nets)
-
-
-def _check_limits(config: Config, spec: tasks.EnvSpec) -> None:
-    count, given = spec.num_costs, np.size(config.cost_limit)
-    if given not in (1, count):
-        wanted = "one number" if count == 1 else f"one number, or {count}"
-        raise UsageError(f"cost_limit has {given} numbers, but task '{spec.name}' has {count} cost(s); give {wanted}")

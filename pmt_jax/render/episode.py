@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import functools
 import pathlib
@@ -140,3 +141,8 @@ def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
     steps = np.arange(len(broken))
     whole = Episode(setup.vector.env, label(setup.config.method), seed, setup.limits, step=steps, **moments, **sums)
     return whole.cut(slice(length))
+
+
+def to_base64(x: np.ndarray) -> str:
+    """Numbers for a page's script: bytes as they are, everything else as little-endian f32."""
+    return base64.b64encode(np.ascontiguousarray(x, "u1" if x.dtype == np.uint8 else "<f4").tobytes()).decode()

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..studies import plot
-from .encode import to_base64
-from .episode import Episode
+from .episode import Episode, to_base64
 
 NUMBER = re.compile(r"[-+]?(\d|$)")  # the beginning of one, or - for none
 RATE = 20.0  # control steps that a replay shows a second

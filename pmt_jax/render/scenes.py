@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 
 from . import gl
-from .encode import to_base64
-from .episode import Episode
+from .episode import Episode, to_base64
 
 POSE_FIELDS = ("qpos", "mocap_pos", "mocap_quat")
 DECORATIONS = 1000  # geoms that an environment may append

@@ -57,6 +57,6 @@ def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", l
 
 
 def plan(task: str, methods: Sequence[str], budget: Mapping[str, str]) -> Points:
-    """A budget's settings of a task: its `source` in configs/ for that task, or its `preset` over the task's own."""
+    """A budget's settings of a task: its `source` for that task, or its `preset` over the task's own."""
     source = budget.get("source", "{task}").format(task=task)
     return make_points([Part(source, {"method": methods})], preset=budget.get("preset", "default"))

@@ -99,7 +99,7 @@ def test_a_file_lists_parts(tmp_path: pathlib.Path, monkeypatch, cli):
     assert {config.seeds for config in seen.values()} == {5}
     assert {config.num_envs for config in seen.values()} == {16}  # the command line has the last word
     assert [config.steps for config in seen.values()] == [4800] * 4 + [9600] * 2
-    assert seen[lanes[0]].activation == "tanh"  # as configs/lane.toml says
+    assert seen[lanes[0]].activation == "tanh"  # as lane in configs/tasks.toml says
 
 
 @pytest.mark.parametrize(

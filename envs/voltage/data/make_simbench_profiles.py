@@ -1,4 +1,4 @@
-"""Makes simbench_profiles.npy.xz from the profiles in the package `simbench` (ODbL 1.0; see NOTICE-simbench.md).
+"""Makes simbench_profiles.npy.xz from the profiles in the package `simbench` (ODbL 1.0; see README.md).
 
   pip install --no-deps simbench==1.6.3 && python envs/voltage/data/make_simbench_profiles.py
 

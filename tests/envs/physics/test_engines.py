@@ -19,7 +19,7 @@ from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
 from envs.hands import hand_over
-from envs.physics import batching, contract, mjx_patches, thread_team, warp_engine
+from envs.physics import contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
 from native import compiled
 from paths import ROOT
@@ -420,7 +420,7 @@ def test_room_for_contacts_in_warp():
 
 
 def test_flattened_turns_any_vmap_into_one_batch():
-    doubled = batching.flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
+    doubled = contract.flattened(lambda x, y: (2 * x + y, jnp.full_like(x, x.shape[0])))
 
     def lone(x, y):
         return jax.tree.map(lambda leaf: leaf[0], doubled(x[None], y[None]))
