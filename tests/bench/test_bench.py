@@ -469,10 +469,10 @@ def test_a_larger_sample_has_the_same_settings_steps_and_source(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Settings newer than a run count as what was done before; a run with another one is no part of the sample."""
-    (table,) = [run for run in stored()["table1_ant_2x4_h200"] if run["method"] == "mappo_l"]
+    (table,) = [run for run in stored()["table1_ant_4x2_h200"] if run["method"] == "mappo_l"]
     more = table | {"seeds": [7], "table": {"reward": [1.0], "cost": [20.0]}}
     older = more | {"config": re.sub(r"^(lambda_rule|episode_starts) = .*\n", "", more["config"], flags=re.M)}
-    others = [more | {"config": more["config"].replace("lambda_init = 2.0", "lambda_init = 4.0")}]
+    others = [more | {"config": more["config"].replace("lambda_init = 3.0", "lambda_init = 4.0")}]
     others += [more | {"source": "evaluation"}, more | {"steps": [x // 2 for x in more["steps"]]}]
     others += [more | {"config": more["config"] + 'walls = "solid"\n'}]
     for name, found in {"table": [table], "more": [more, older], "others": others}.items():
@@ -481,7 +481,7 @@ def test_a_larger_sample_has_the_same_settings_steps_and_source(
     assert runs.as_larger(tmp_path / "others.json").splitlines()[2:] == []
     (line,) = runs.as_larger(tmp_path / "more+others.json").splitlines()[2:]
     mean = (sum(table["table"]["reward"]) + 2.0) / 7
-    assert line.startswith(f"| `ant_2x4` | `mappo_l` | 7 | {mean:,.4g} |") and line.endswith("| 20 | 10 | 5 of 7 |")
+    assert line.startswith(f"| `ant_4x2` | `mappo_l` | 7 | {mean:,.4g} |") and line.endswith("| 20 | 10 | 5 of 7 |")
 
 
 def test_curves_are_stored_with_as_many_points_as_asked_and_tables_come_from_all_rows(tmp_path: pathlib.Path):
