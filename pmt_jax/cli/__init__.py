@@ -4,11 +4,15 @@ Imports everything below it, most of it only when a command runs."""
 
 from __future__ import annotations
 
+import atexit
 import codecs
+import contextlib
 import gc
 import os
 import sys
+import threading
 from collections.abc import Sequence
+from typing import NoReturn
 
 OBJECTS = 100_000  # new ones before Python looks for garbage; a trace makes many that stay
 
@@ -24,6 +28,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         return commands.run(argv)
     except KeyboardInterrupt:
         return 130
+
+
+def run(argv: Sequence[str] | None = None) -> NoReturn:
+    """`main`, then the end of the process without that of the interpreter.
+
+    A thread of C++ that frees an array of Python's while the interpreter ends aborts the process, with the run saved
+    and another exit code. What is registered to run at the end runs before.
+    """
+    code = main(argv)
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and not thread.daemon:
+            thread.join()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # closed, or nobody reads it any more
+            stream.flush()
+    os._exit(code)
 
 
 def _use_utf8() -> None:

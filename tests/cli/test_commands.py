@@ -58,10 +58,24 @@ def test_resuming_with_other_settings_shows_what_differs(whole: pathlib.Path, cl
 
 CTRL_C = """
 import signal, sys
-from pmt_jax.cli import main
+from pmt_jax.cli import run
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
-sys.exit(main(sys.argv[1:]))
+run(sys.argv[1:])
 """
+
+
+def test_a_process_ends_with_its_code_and_what_is_registered_and_no_thread_is_cut_off():
+    """Also where a thread that nobody joins would run on while the interpreter ends."""
+    program = """
+import atexit, sys, threading, time
+from pmt_jax import cli
+atexit.register(print, "registered")
+threading.Thread(target=lambda: (time.sleep(0.2), print("joined"))).start()
+threading.Thread(target=lambda: time.sleep(1000), daemon=True).start()
+cli.run(["version?"])
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment())
+    assert result.returncode == 2 and result.stdout.split() == ["joined", "registered"]
 
 
 @pytest.mark.full
