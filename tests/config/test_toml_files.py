@@ -62,7 +62,7 @@ def test_the_command_lines_options_join_those_of_the_file():
 
 def test_the_papers_settings_extend_the_tasks_own():
     paper, own = load_config("paper/ant_2x4", method="r4sg"), load_config("ant_2x4", method="r4sg")
-    assert (paper.task, paper.seeds, paper.steps, paper.env) == ("ant_2x4", 5, 10_000_000, own.env)
+    assert (paper.task, paper.seeds, paper.steps, paper.env) == ("ant_2x4", 20, 10_000_000, own.env)
 
 
 def test_every_file_and_every_preset_describes_itself():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import collections
+import functools
 import pathlib
 import re
 
@@ -170,13 +172,20 @@ def test_regret_learns_how_deliberate_a_costly_action_was():
 # The paper's equations
 
 
-@pytest.mark.parametrize("number", [3, 4, *range(8, 18)])
-def test_every_equation_is_one_function(number: int):
-    named = []
+@functools.cache
+def functions_of_equations() -> dict[str, list[str]]:
+    """Of each equation's number, the functions whose docstrings name it."""
+    named = collections.defaultdict(list)
     for path in pathlib.Path(pmt_jax.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
                 for numbers in re.findall(r"Eq\. (\d+(?:, \d+)*)", ast.get_docstring(node) or ""):
-                    if str(number) in numbers.split(", "):
-                        named.append(f"{path.name}:{node.name}")
+                    for number in numbers.split(", "):
+                        named[number].append(f"{path.name}:{node.name}")
+    return named
+
+
+@pytest.mark.parametrize("number", [3, 4, *range(8, 18)])
+def test_every_equation_is_one_function(number: int):
+    named = functions_of_equations()[str(number)]
     assert len(named) == 1, named

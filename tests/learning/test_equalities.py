@@ -85,6 +85,7 @@ def test_crpo_within_its_limit_is_happo():
     assert metrics["lambda"] == 1 and differ(weights(beyond)["actor"], weights(within)["actor"])
 
 
+@pytest.mark.full
 def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
     setup, _, batch = acted()
     setup = dataclasses.replace(setup, method=METHODS["crpo"])
@@ -116,6 +117,7 @@ def test_a_multiplier_that_acts_makes_a_difference():
     assert differ(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
+@pytest.mark.full
 def test_pid_weighs_costs_by_three_terms():
     """A proportional gain weighs costs as a larger multiplier does, from the first update on."""
     plain, limit = program("mappo_l"), {"cost_limit": 8.0}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from small import program
 
@@ -33,6 +34,7 @@ def test_a_first_batch_without_any_cost_leaves_fear_finite():
     assert (jax.nn.sigmoid(SETUP.nets.fear(awake, STATES)) < 0.002).all()
 
 
+@pytest.mark.full
 def test_an_update_from_nan_is_finite_everywhere():
     hyper = PROGRAM.hyper()
     state, metrics = PROGRAM.step(hyper, PROGRAM.init(hyper, jax.random.key(0)))

@@ -119,6 +119,7 @@ def test_sequences_give_the_policy_that_acted(method: str):
     assert apart[0] > 1e-4 and apart[4:].max() < 1e-5  # until the first episode ends
 
 
+@pytest.mark.full
 @METHODS
 def test_critics_remember_as_step_after_step(method: str):
     setup, before, after, batch = acted(method)
@@ -203,6 +204,7 @@ def test_only_a_policy_that_remembers_comes_near_the_optimum():
 # Runs, and what is made of them
 
 
+@pytest.mark.full
 def test_resumed_within_an_episode_bit_for_bit(trained: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     out = tmp_path / "run"
     stop_after_rows(monkeypatch, signal.SIGTERM)
@@ -214,6 +216,7 @@ def test_resumed_within_an_episode_bit_for_bit(trained: pathlib.Path, tmp_path: 
     assert_same_run(out, trained)
 
 
+@pytest.mark.full
 def test_policies_loaded_exported_and_drawn_act_as_the_one_that_was_evaluated(
     trained: pathlib.Path, tmp_path: pathlib.Path, cli
 ):
@@ -275,6 +278,7 @@ def test_weights_in_numpy_and_onnx_for_every_kind_of_network(changes: dict, tmp_
         onnx_policy.check(tmp_path / "policy.onnx", [obs, hidden], [np.asarray(mean), np.asarray(after)])
 
 
+@pytest.mark.full
 def test_a_policy_in_the_hub(trained: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(hub, "FOLDER", tmp_path)
     run, _, state = load.load_seed(trained, 1)

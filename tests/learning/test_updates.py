@@ -168,6 +168,7 @@ def test_an_update_moves_no_policy_further_than_kl_max(method: str):
     chex.assert_trees_all_equal(made.step(made.hyper(kl_max=2 * far.max()), start)[0], free)
 
 
+@pytest.mark.full
 def test_the_weight_of_entropy_has_a_sign():
     """Above 0 an update leaves more noise of actions than at 0, below 0 less."""
     made = program("mappo_l")
@@ -238,6 +239,7 @@ def estimated(batch: Batch, previous: jax.Array, limit: float = 1.0) -> jax.Arra
     return constraint.estimate_cost(made.setup, made.hyper(cost_limit=limit), batch, previous, jnp.zeros(()))
 
 
+@pytest.mark.full
 def test_the_estimate_averages_over_an_episodes_time():
     """It needs no episode that ends: a rollout of 5 of 25 steps goes a fifth of the way, one of 25 all of it."""
     _, _, batch = acted()

@@ -57,8 +57,8 @@ def test_intervals_move_with_the_scores(x: list[float], shift: float):
         np.testing.assert_allclose(interval(np.add(x, shift)), (low + shift, high + shift), atol=1e-6)
 
 
-@pytest.mark.parametrize("seeds", [5, 20])
-@pytest.mark.parametrize("draw", ["normal", "standard_t", "exponential"])
+@pytest.mark.parametrize("seeds", [5, pytest.param(20, marks=pytest.mark.full)])
+@pytest.mark.parametrize("draw", [pytest.param("normal", marks=pytest.mark.full), "standard_t", "exponential"])
 def test_intervals_cover_what_they_estimate_as_often_as_they_say(seeds: int, draw: str):
     """95 % of 2,000 samples, normal, with heavy tails, or skewed; the percentile bootstrap's covers 81 to 91 % of five.
 
@@ -75,7 +75,8 @@ def test_intervals_cover_what_they_estimate_as_often_as_they_say(seeds: int, dra
         assert (0.86 if skewed_mean else 0.92) < covered < 0.985
 
 
-@pytest.mark.parametrize("seeds", [5, pytest.param(20, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("seeds", [5, 20])
 def test_the_interval_of_an_improvement_covers_it(seeds: int):
     rng = np.random.default_rng(0)
     for shift in (0.0, 1.0, 2.0):

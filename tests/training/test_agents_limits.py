@@ -148,12 +148,14 @@ def test_the_state_that_is_kept_as_best_was_judged_by_the_worst_agent(run: pathl
     assert saved["best"].cost == pytest.approx([8.0])
 
 
+@pytest.mark.full
 def test_a_picture_sums_the_cost_of_the_agent_who_has_most(run: pathlib.Path):
     with trusting():
         shown = episode.record_run(run)
     assert shown.cost_sum[-1] == 18 and str(shown.limits) == "10" and shown.cost.max() == 0.5
 
 
+@pytest.mark.full
 def test_the_policy_that_is_published_keeps_every_agent_within(file: pathlib.Path, tmp_path: pathlib.Path):
     """Of one that pushes with agent 0 alone (25 of an allowed 15, mean 12.5) and one that does not push, the second."""
     config = load_config(f"{file}:Pushes", method="mappo_l", num_envs=4, hidden=[8], cost_limit=15)
@@ -216,7 +218,7 @@ def test_a_task_that_only_says_that_its_agents_share_costs_is_refused_or_stops(f
     assert not [name for name in rows(tmp_path / "run")[0] if "spread" in name or "agent_0" in name]
 
 
-@pytest.mark.parametrize("task", ["lane", "switch", "noisy"])
+@pytest.mark.parametrize("task", ["lane", *(pytest.param(x, marks=pytest.mark.full) for x in ("switch", "noisy"))])
 def test_agents_that_share_costs_have_one_column(task: str):
     setup = make_setup(load_config(task, method="f4sg", num_envs=2, hidden=[8]))
     state = jax.eval_shape(lambda: learner.init(setup, setup.hyper, jax.random.key(0)))

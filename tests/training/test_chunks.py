@@ -59,7 +59,7 @@ def test_a_row_is_the_same_however_it_is_cut(cuts: list[int], room: int):
     assert row.metrics["finite"].tolist() == [True, False]
 
 
-@pytest.mark.parametrize("length", [1, 2])
+@pytest.mark.parametrize("length", [1, pytest.param(2, marks=pytest.mark.full)])
 def test_rows_and_states_do_not_depend_on_the_chunks(
     length: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
 ):

@@ -47,6 +47,7 @@ def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
     assert "unknown checkpoint 'bset'; did you mean 'best'?" in cli("eval", whole, "--which", "bset")[2]
 
 
+@pytest.mark.full
 def test_every_step_of_an_evaluation_can_be_saved(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     file = tmp_path / "episodes.npz"
     code, text, _ = cli("eval", whole, "--episodes", 3, "--save", file)
@@ -114,6 +115,7 @@ def test_steps_after_the_end_of_an_episode_are_zero(tmp_path: pathlib.Path, cli)
             assert (np.asarray(x[4:, 0]) == 0).all() and np.isfinite(x[:3]).all()
 
 
+@pytest.mark.full
 def test_what_was_chosen_is_evaluated_from_other_starts(monkeypatch):
     monkeypatch.setattr(evaluate, "load_run", lambda *_: ())
     monkeypatch.setattr(evaluate, "evaluate_states", lambda *_, fresh, save: fresh)

@@ -65,7 +65,7 @@ def test_a_host_callback_that_raises_costs_one_chunk(tmp_path: pathlib.Path, cli
         (MemoryError(), f"out of memory; {failures.LESS}"),
     ],
 )
-@pytest.mark.parametrize("program", ["chunk", "evaluate"])
+@pytest.mark.parametrize("program", ["chunk", pytest.param("evaluate", marks=pytest.mark.full)])
 def test_memory_and_devices(
     program: str, raised: Exception, said: str, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
 ):

@@ -22,6 +22,12 @@ from runs import TINY, rows
 RUN = (*TINY, "--method", "mappo", "--steps", 400, "--seeds", 2, "--no-cache", "--episode-starts", "together")
 
 
+def each_fault(*default: str):
+    """A test of every fault, of some by default."""
+    faults = [x if x in default else pytest.param(x, marks=pytest.mark.full) for x in faulty.FAULTS]
+    return pytest.mark.parametrize("fault", faults)
+
+
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.floats(-2, 3, width=32), min_size=1, max_size=6))
 def test_rounding_is_no_fault(costs: list[float]):
@@ -30,7 +36,7 @@ def test_rounding_is_no_fault(costs: list[float]):
     assert not out_of_range(jnp.float32([0, 1, 1 + 1e-7, -1e-7])).any()
 
 
-@pytest.mark.parametrize("fault", list(faulty.FAULTS))
+@each_fault("lcostbig", "lnan", "linfonan")
 def test_what_one_step_of_each_kind_does(fault: str, tmp_path: pathlib.Path):
     """Only what is not finite outside of `info` ends the episode and costs; a cost out of range stays as it is."""
     vector = VectorEnv(tasks.make(str(faulty.write(tmp_path, fault))), 3)
@@ -47,9 +53,7 @@ def test_what_one_step_of_each_kind_does(fault: str, tmp_path: pathlib.Path):
     assert np.isfinite(outcome.reward).all() and np.isfinite(outcome.next_obs).all()
 
 
-@pytest.mark.parametrize(
-    "fault", [x if x in ("lcostbig", "lnan") else pytest.param(x, marks=pytest.mark.full) for x in faulty.FAULTS]
-)
+@each_fault("lnan")
 def test_an_evaluation_counts_them(fault: str, tmp_path: pathlib.Path):
     found = play(tasks.make(str(faulty.write(tmp_path, fault))), lambda env, t: jnp.zeros((2, 2, 2)), 2)
     assert found["non_finite"].tolist() == [float(fault in faulty.NOT_FINITE)] * 2

@@ -83,7 +83,7 @@ def happens(monkeypatch: pytest.MonkeyPatch):
     return arrange
 
 
-QUICK = ((deleted, 600), (renamed, STEPS), (locked_by_another, 600), (without_rows, 600))
+QUICK = ((deleted, 600), (renamed, STEPS))
 REST = {(what, step): pytest.mark.full if step == 600 else pytest.mark.slow for what in HOW for step in (600, STEPS)}
 
 

@@ -87,7 +87,7 @@ def test_training_starts_without_warps_private_places(cli, tmp_path, monkeypatch
 def test_verbose_asks_for_what_warp_prints(cli, tmp_path, monkeypatch):
     logger = logging.getLogger("envs")
     monkeypatch.setattr(logger, "level", logging.NOTSET)
-    assert cli("train", *ARGUMENTS, "--steps", 200, "--out", tmp_path / "run", "--verbose")[0] == 0
+    assert cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run", "--verbose")[0] == 0
     assert logger.isEnabledFor(logging.INFO)
 
 

@@ -61,7 +61,7 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
     assert not list((out / "checkpoints").glob("*tmp"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.full)])
 def test_a_signal_saves_and_the_command_continues(
     number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
 ):
@@ -172,13 +172,15 @@ def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli
     metrics = copy / "metrics.jsonl"
     text = metrics.read_text()
     metrics.write_text(text[: len(text) // 2])
-    code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 200)
+    shutil.rmtree(copy / "checkpoints" / str(STEPS))
+    code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
     assert code == 0 and "changed since the run began: jax 0.1 -> " in text
-    assert f"{metrics} lacks 8 of 16 rows up to step 1,600: 4 of seed 0 (between steps 1,000 and 1,600), 4 of" in text
+    assert f"{metrics} lacks 6 of 14 rows up to step 1,400: 3 of seed 0 (between steps 1,000 and 1,400), 3 of" in text
     steps = [row["step"] for row in rows(copy)]
-    assert steps[-1] == STEPS + 200 and 1000 not in steps
+    assert steps[-1] == STEPS and 1000 not in steps
 
 
+@pytest.mark.full
 def test_fewer_steps_than_are_done_change_nothing(copy: pathlib.Path, cli):
     before = {path.name: path.read_bytes() for path in copy.glob("*.*")}
     code, text, _ = cli("train", *ARGUMENTS, "--steps", 400, "--out", copy, "--resume")
@@ -215,6 +217,7 @@ def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
     assert "was simulated by engine 'warp', but physics = auto means 'xla' on this cpu" in err
 
 
+@pytest.mark.full
 def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
     place, remount = small_disk
     out = place / "run"
@@ -245,6 +248,7 @@ def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Pat
     assert run_log.read(copy).identity != run_log.read(whole).identity
 
 
+@pytest.mark.full
 def test_a_run_that_has_ended_says_what_would_train(copy: pathlib.Path, cli):
     """It would drop the other settings otherwise."""
     command = ("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")

@@ -312,6 +312,7 @@ def test_own_robots_see_each_other_and_pay_for_touching(agents):
     assert (touching.cost[:, :2, 1] == 1).all() and (touching.info["cost_contact_other_1"] == 1).all()
 
 
+@pytest.mark.full
 def test_what_mujoco_calls_a_contact_is_what_counts():
     """Random points and vases: geoms overlap exactly where the engine lists contacts."""
     model = models.model("point", 2, 10, 2.0)
@@ -419,6 +420,7 @@ def test_auto_takes_fused_where_it_has_room():
 VIOLET = HAZARD_COLOUR[:3]
 
 
+@pytest.mark.full
 def test_a_picture_shows_goals_hazards_lidars_and_who_pays():
     env, *_ = made(*POINT_2)
     paying = stepped(made(*POINT_2), hazard=(-1.6, -1.5))

@@ -234,6 +234,7 @@ def test_large_batches_among_matmuls_and_threads_do_not_deadlock(cpus):
     assert done.stdout.strip() == "ok", done.stderr
 
 
+@pytest.mark.full
 def test_programs_with_calls_are_cached_on_disk(tmp_path):
     script = """
         import jax, jax.numpy as jnp

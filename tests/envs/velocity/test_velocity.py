@@ -159,6 +159,7 @@ def test_padding_of_unequal_agents_is_ignored():
     np.testing.assert_array_equal(after.info["reward_ctrl"], [0.0, 0.0])
 
 
+@pytest.mark.full
 def test_any_partition_drives_the_same_robot():
     whole = envs.make("velocity_half_cheetah_2x3", partition=((5, 4, 3, 2, 1), (0,)), **PLAIN)
     halves = envs.make("velocity_half_cheetah_2x3", **PLAIN)
@@ -188,6 +189,7 @@ def test_costs_of_speed():
     assert moving_at(cheetah(threshold=2.0, cost="excess"), 1.0).cost.tolist() == [[0], [0]]
 
 
+@pytest.mark.full
 def test_falling_as_a_second_cost():
     env = envs.make("velocity_hopper_3x1", fall_cost=True, physics="mujoco")
     assert env.spec.num_costs == 2 and env.spec.cost_limit == (25.0, 0.1)

@@ -61,7 +61,10 @@ def mismatch(case: str, vm: np.ndarray, va: np.ndarray) -> np.ndarray:
     return np.abs(power - (p + 1j * q))[:, child].max(axis=1)
 
 
-@pytest.mark.parametrize(("dtype", "restricted"), [("float32", False), ("float32", True), ("float64", False)])
+@pytest.mark.parametrize(
+    ("dtype", "restricted"),
+    [pytest.param("float32", False, marks=pytest.mark.full), ("float32", True), ("float64", False)],
+)
 @pytest.mark.parametrize("case", CASES)
 def test_convergence_is_told_apart_from_collapse(case: str, dtype: str, restricted: bool) -> None:
     flow, data = solved(case, dtype, restricted), recorded(case)
@@ -109,6 +112,7 @@ def test_branch_losses_add_up(case: str) -> None:
     np.testing.assert_allclose((flow.slack_mw + p.sum(axis=1))[ok], flow.line_loss_mw[ok], atol=1e-8)
 
 
+@pytest.mark.full
 def test_a_single_solve_equals_its_batch() -> None:
     p, q = (jnp.asarray(x[:3], jnp.float32) for x in injections("case33"))
     network = power_flow.load_network("case33")
