@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import envs
-from batches import assert_batches_agree, assert_same
 from envs import native, physics
 from envs.ant import walls
 from envs.errors import TaskError
@@ -36,6 +35,8 @@ from pmt_jax import tasks
 from stepping import (
     answers,
     anywhere,
+    assert_batches_agree,
+    assert_same,
     by_c,
     by_robot,
     check,
