@@ -48,7 +48,7 @@ for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the 
 
 
 gc.set_threshold(100_000)  # as `pmt` has it: traces make many objects that stay
-MOST_MEMORY = 1.5e9  # bytes of a process of the tests, beyond which it forgets what it compiled
+MOST_MEMORY = 2e9  # bytes of a process of the tests, beyond which it forgets what it compiled
 
 
 def pytest_configure(config: pytest.Config) -> None:

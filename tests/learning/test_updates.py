@@ -219,6 +219,7 @@ def test_every_network_keeps_what_it_learned():
         assert (jax.tree.leaves(now.opt_state)[0] > 0).all()  # steps of Adam
 
 
+@pytest.mark.full
 def test_observations_are_normalised_with_what_was_seen_before():
     state, _ = trained("mappo_l")
     assert state.obs_moments.weight == 3 * 8 * 25 * 2  # updates, environments, steps, agents

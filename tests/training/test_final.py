@@ -49,6 +49,7 @@ def test_the_end_of_a_run_is_what_eval_measures(whole: pathlib.Path, cli):
     assert data["mean_actions"]["within"] == sum(row["episode_cost"] <= row["cost_limit"] for row in found)
 
 
+@pytest.mark.full
 def test_a_run_that_trains_on_is_evaluated_anew(copy: pathlib.Path, cli):
     before = (copy / final.FILE).read_text()
     code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")

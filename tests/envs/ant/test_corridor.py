@@ -195,6 +195,7 @@ def test_agents_drive_the_motors_in_order():
     np.testing.assert_allclose(a.info["reward_ctrl"], -0.5 * np.sum(np.asarray(action) ** 2), rtol=1e-6)
 
 
+@pytest.mark.full
 def test_free_partitions_drive_the_motors_that_they_name():
     two = envs.make("ant_2x4", physics="mujoco")
     free = envs.make("ant_2x4", physics="mujoco", partition="0,7,2,3,4,5|6,1")
