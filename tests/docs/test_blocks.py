@@ -64,15 +64,13 @@ SMALLER: list[tuple[str, str | Callable[[re.Match[str]], str]]] = [
     (r"train paper/ant_2x4 --method f4sg$", "train paper/ant_2x4 --method mappo"),
     (r"train velocity_ant_2x4", "train lane"),
     (r"eval runs/x --physics", "eval hub:ant_2x4/mappo_l --physics"),
-    (r"method=mappo_l,f4sg,r4sg", "method=mappo"),
+    (r"method=mappo_l,f4sg,r4sg", "method=f4sg"),
     (r"sweep study\.toml (.*--part)", r"sweep lane --set clip=0.1,0.2 --method mappo \1"),
     (r"\[64,64\],\[128,128\]", "[32,32]"),
     (r"bench run.*", 'bench run ant --quick --only "plain loop"'),
     (r"HEAD~5", "bench/results"),  # a checkout may be shallow
     (r'load_config\("lane", method="f4sg"\)', 'load_config("lane", method="f4sg", steps=2000, num_envs=8)'),
-    # All runs on `lane` are of the method that compiles fastest; those on `ant_2x4` are README's.
-    (r"(train lane.*) --method f4sg", r"\1 --method mappo"),
-    (r"train lane(?!.*--method)", "train lane --method mappo"),
+    # Programs that no other command shares are of the method that compiles fastest.
     (r'load_config\("lane", (method="f4sg", )?(?!method)', 'load_config("lane", method="mappo", '),
     (r"train (my_settings\.toml|voltage_33|ant_2x4(?= --env))", r"train \1 --method mappo"),
     (r"train (docs/examples/my_env\.py) --method f4sg", r"train \1 --method mappo"),
