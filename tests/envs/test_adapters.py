@@ -398,6 +398,7 @@ def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
     assert all(truncated.values()) and parallel.agents == [] and infos["agent_1"]["cost"] == [1]
 
 
+@pytest.mark.full
 def test_brax_wrappers_accept_a_task_and_say_what_it_says():
     pytest.importorskip("brax")
     from brax.envs.wrappers import training

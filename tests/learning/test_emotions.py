@@ -229,6 +229,7 @@ def test_an_update_from_nan_is_finite_everywhere():
     assert jnp.isfinite(metrics["fear/loss"])
 
 
+@pytest.mark.full
 def test_fear_tells_danger_from_safety_after_sixty_updates():
     """Of 12 seeds the mean squared error is 0.240 +- 0.007 in the first update and 0.037 +- 0.009 in the last."""
     hyper = PROGRAM.hyper(actor_lr=0.0)

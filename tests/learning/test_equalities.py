@@ -63,6 +63,7 @@ def test_ippo_of_one_agent_that_observes_the_state_is_mappo():
     chex.assert_trees_all_close(*states, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.full
 def test_critics_of_observations_see_nothing_of_other_agents():
     made = program("ippo_l")
     state = made.init(made.setup.hyper, jax.random.key(0))
@@ -137,7 +138,8 @@ def test_pid_weighs_costs_by_three_terms():
     )
 
 
-@pytest.mark.parametrize("method", ["mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["mappo_l", "macpo"])
 def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
     """Also by an estimate that remembers what it began with: no excess."""
     kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5)
@@ -207,6 +209,7 @@ def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
     assert differ(updated("macpo_regret"), plain)
 
 
+@pytest.mark.full
 def test_regret_stands_still_where_nothing_ever_costs():
     setup, state, batch = acted()
     now = schedules.at(setup.config, setup.hyper, jnp.int32(0))

@@ -230,6 +230,7 @@ def test_the_weight_has_no_bound_and_no_padding():
     assert jnp.isfinite(letter.log_weight(jnp.asarray([200.0]), jnp.zeros(1), jnp.ones(1), jnp.ones(1), jnp.inf))
 
 
+@pytest.mark.full
 def test_the_weight_moves_in_the_epochs():
     state, batch = acted("r4sg_letter")
     net, weights, _ = appraise("regret")(R4SG.setup.hyper, state.regret, batch, jax.random.key(7))

@@ -251,6 +251,7 @@ def test_the_estimate_averages_over_an_episodes_time():
     np.testing.assert_allclose(estimated(batch, previous), 25 * batch.cost.mean((0, 1)), rtol=1e-5)
 
 
+@pytest.mark.full
 def test_a_cut_excess_of_the_average_sees_rare_costs():
     """One batch in five has a cost of five limits: as much as is allowed. Cut rates would say it is far within."""
     quiet, costly = jnp.zeros((1, 1, 1, 1)), jnp.full((1, 1, 1, 1), 0.2)  # at a limit of 1 in 25 steps

@@ -73,6 +73,7 @@ def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp
     assert rows(out)[0]["fear/loss"] != rows(whole)[0]["fear/loss"]
 
 
+@pytest.mark.full
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
     whole: pathlib.Path, tmp_path: pathlib.Path, cli
 ):

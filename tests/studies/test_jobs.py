@@ -97,11 +97,12 @@ while True:
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("sent", "heard"),
     [
-        pytest.param(signal.SIGINT, signal.SIGINT, marks=pytest.mark.full),
-        pytest.param(signal.SIGTERM, signal.SIGTERM, marks=pytest.mark.full),
+        (signal.SIGINT, signal.SIGINT),
+        (signal.SIGTERM, signal.SIGTERM),
         (signal.SIGKILL, signal.SIGTERM),
     ],
 )

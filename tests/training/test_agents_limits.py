@@ -102,6 +102,7 @@ def run(file: pathlib.Path) -> pathlib.Path:
     return out
 
 
+@pytest.mark.full
 def test_a_row_names_each_agent(run: pathlib.Path):
     """Agent 0 costs 18 of an allowed 10 (8 with the margin), agent 1 nothing; their mean is within the limit."""
     for found in rows(run):
@@ -117,6 +118,7 @@ def test_a_row_names_each_agent(run: pathlib.Path):
     assert last["lambda"] == pytest.approx((last["lambda/agent_0"] + last["lambda/agent_1"]) / 2)
 
 
+@pytest.mark.full
 def test_tables_and_the_console_say_that_the_limit_is_violated(run: pathlib.Path, cli):
     (data,) = json.loads(cli("table", run, "--format", "json")[1])["rows"]
     assert (data["within"], data["worst"], data["cost_limit"]) == (0, 18, 10)
@@ -133,6 +135,7 @@ def test_tables_and_the_console_say_that_the_limit_is_violated(run: pathlib.Path
         assert re.search(rf"^  {name} +{mean}\.0000 ", text, re.MULTILINE)
 
 
+@pytest.mark.full
 def test_a_run_is_compared_by_its_worst_agent(run: pathlib.Path, tmp_path: pathlib.Path, cli):
     other = tmp_path / "other"
     other.mkdir()
@@ -142,6 +145,7 @@ def test_a_run_is_compared_by_its_worst_agent(run: pathlib.Path, tmp_path: pathl
     assert "worst agent (limit 10)  18 [-]" in text and "seeds within the limit  0 of 1" in text
 
 
+@pytest.mark.full
 def test_the_state_that_is_kept_as_best_was_judged_by_the_worst_agent(run: pathlib.Path):
     """None is within, so that its excess is kept, by which later states are judged."""
     saved = run_folder.load_saved(run)[2]

@@ -307,6 +307,7 @@ def test_what_is_only_logged_changes_nothing_else(tmp_path: pathlib.Path, cli):
         assert row["info/position"] is None
 
 
+@pytest.mark.full
 def test_a_task_that_keeps_the_contract_is_not_accused(whole: pathlib.Path, cli):
     assert all(row["non_finite"] == row["cost_out_of_range"] == 0 and row["worst_cost"] is None for row in rows(whole))
     assert "steps were not finite" not in cli("table", whole)[1] and "note:" not in cli("eval", whole)[1]

@@ -225,6 +225,7 @@ def test_evaluations_during_training(whole: pathlib.Path, cli):
         assert f"{row['eval/episode_reward']:12.4f} +- {row['eval/episode_reward/ci95']:.4f}" in text
 
 
+@pytest.mark.full
 def test_the_best_is_the_best_of_the_evaluations(whole: pathlib.Path, cli):
     expected = []
     for seed in (0, 1):
@@ -292,6 +293,7 @@ def test_minari_without_its_extra(whole: pathlib.Path, cli, monkeypatch: pytest.
     assert code == 2 and "this needs minari, which is missing here: pip install 'pmt-jax[minari]'" in error
 
 
+@pytest.mark.full
 def test_steps_after_the_end_of_an_episode_are_zero(tmp_path: pathlib.Path, cli):
     file = tmp_path / "episodes.npz"
     assert cli("eval", "noisy", "--policy", "zero", "--save", file)[0] == 2  # toys have no baselines

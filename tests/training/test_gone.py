@@ -128,6 +128,7 @@ def test_two_that_go_do_not_overwrite_each_other(tmp_path: pathlib.Path, cli, ha
     assert {path.name for path in tmp_path.iterdir()} == {"run-rescued", "run-rescued-2"}
 
 
+@pytest.mark.full
 def test_a_run_that_goes_on_says_so_before_it_writes(copy: pathlib.Path, cli, monkeypatch):
     """The folder may go while the program compiles."""
     compile_run = trainer.compile_run

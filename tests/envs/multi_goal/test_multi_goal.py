@@ -223,6 +223,7 @@ def stepped(task, action=0.0, hazard=(1.8, 1.8), qpos=None, qvel=None, owner=0):
 THRUST = [[1.0, -1.0], [0.0, 0.0]]
 
 
+@pytest.mark.full
 def test_agents_of_the_reference_share_the_points_motors():
     qvel = stepped(made(*POINT_2), THRUST).carry.physics.qvel
     assert qvel[0] > 1e-3 and qvel[3] < -1e-3 and abs(qvel[2]) < 1e-6  # agent 0 drives both, agent 1 turns none
@@ -289,7 +290,7 @@ def test_observations_are_standardised_over_their_own_entries():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("agents", [2, 5])
+@pytest.mark.parametrize("agents", [2, 3])
 def test_own_robots_see_each_other_and_pay_for_touching(agents):
     env, _, step, reset = own(agents)
     start = reset(jax.random.split(jax.random.key(2), 64))
@@ -304,7 +305,7 @@ def test_own_robots_see_each_other_and_pay_for_touching(agents):
     nearest = np.maximum(0, 1 - apart.min(1) / 3)
     np.testing.assert_allclose(shown[:, where["lidar of other robots"]].max(1), nearest, atol=1e-5)
     goal = np.linalg.norm(places[:, :2] - np.asarray(state.carry.goals), axis=1)
-    np.testing.assert_allclose(shown[:, where["lidar of own goal"]].max(1), 1 - goal / 3, atol=1e-5)
+    np.testing.assert_allclose(shown[:, where["lidar of own goal"]].max(1), np.maximum(0, 1 - goal / 3), atol=1e-5)
     qpos = start.carry.physics.qpos
     physics = dataclasses.replace(start.carry.physics, qpos=qpos.at[:, 3:5].set(qpos[:, :2] + 0.1))
     carry = dataclasses.replace(start.carry, physics=physics)

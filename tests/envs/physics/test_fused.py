@@ -295,6 +295,7 @@ def test_no_world_depends_on_its_neighbours(robot, others):
     assert np.isnan(again["qpos"][~whole]).all()
 
 
+@pytest.mark.full
 def test_single_precision_outside_costs_half_a_micrometre():
     """Numbers inside are double, whatever the arrays are."""
     rows = states("corridor", "visited").astype(np.float32)

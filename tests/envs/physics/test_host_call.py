@@ -75,6 +75,7 @@ def test_dtypes(call, dtype):
     np.testing.assert_array_equal(out, expected(x))
 
 
+@pytest.mark.full
 def test_wide_dtypes():
     done = run("""
         import jax, jax.numpy as jnp, numpy as np

@@ -76,13 +76,13 @@ def check_replay(name: str, physics: str) -> None:
     np.testing.assert_array_equal(after.terminated, rows["terminated"])
 
 
-@each()
+@each("velocity_humanoid_9_8")
 def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
 
 
 ON_FUSED = {
-    "velocity_hopper_3x1": (),
+    "velocity_hopper_3x1": pytest.mark.full,
     "velocity_swimmer_2x1": pytest.mark.full,
     "velocity_humanoid_9_8": pytest.mark.full,
 }
@@ -108,7 +108,7 @@ def test_reproduces_the_recorded_steps_on_warp(name):
     check_replay(name, "warp")
 
 
-@each()
+@each("velocity_humanoid_9_8")
 def test_reproduces_the_recorded_resets(name):
     rows, (_, restore, _) = recording(name), made(name)
     state = restore(rows["reset_qpos"], rows["reset_qvel"])

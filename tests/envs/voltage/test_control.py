@@ -87,6 +87,7 @@ def first(env, **raw):
     return jax.jit(env.restore)(**{"start_row": 603, "q": np.zeros(env.spec.num_agents), **raw})
 
 
+@pytest.mark.full
 def test_specs_are_mapdns() -> None:
     small, large = envs.make("voltage_33").spec, envs.make("voltage_141").spec
     assert (small.num_agents, small.obs_dim, small.state_dim, small.horizon) == (6, 50, 144, 239)
