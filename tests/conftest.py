@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import functools
 import gc
 import importlib.metadata
 import os
@@ -13,12 +14,15 @@ import platform
 import shutil
 import signal
 import subprocess
+from collections.abc import Callable
+from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's complaints about programs it takes from the cache
 
 import jax
 import psutil
 import pytest
+from jax._src.interpreters import mlir
 
 # Tests compile far longer than they run: with the least of optimisation programs compile in a quarter of the time.
 # Without fused multiply-adds, which XLA places as it happens to fuse, programs that compute the same agree bit for bit.
@@ -44,7 +48,7 @@ for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the 
 
 
 gc.set_threshold(100_000)  # as `pmt` has it: traces make many objects that stay
-MOST_MEMORY = 1.5e9  # bytes of a process of the tests, beyond which it forgets what it compiled
+MOST_MEMORY = 2e9  # bytes of a process of the tests, beyond which it forgets what it compiled
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -54,12 +58,28 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("CXX", f"{compiler} -O1")  # for processes that tests start, too
 
 
+@functools.cache
+def context_of_programs(make: Callable[[], Any]) -> Any:
+    return make()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def programs_have_one_context():
+    """JAX loads the dialects of MLIR anew for every program, which takes longer than to lower a small one."""
+    make = getattr(mlir, "make_ir_context", None)
+    with pytest.MonkeyPatch.context() as patch:
+        if make:
+            patch.setattr(mlir, "make_ir_context", lambda: context_of_programs(make))
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def memory_is_bounded():
     """After a file JAX forgets what it has compiled if that is much, and the memory is freed; `runs` keeps its own."""
     yield
     if psutil.Process().memory_info().rss > MOST_MEMORY:
         jax.clear_caches()
+        context_of_programs.cache_clear()
         gc.collect()
         with contextlib.suppress(AttributeError):  # of glibc
             ctypes.CDLL(None).malloc_trim(0)

@@ -306,17 +306,19 @@ def as_mean_actions(file: pathlib.Path) -> str:
     A + joins the names of several files.
     """
     stored = [run for name in file.stem.split("+") for run in load(file.with_stem(name))]
-    found = sorted(stored, key=lambda run: (run["cost_limit"], list(METHODS).index(run["method"])))
+    order = list(METHODS)
+    found = sorted(stored, key=lambda run: (run["task"], run["cost_limit"], order.index(run["method"])))
+    several = len({run["task"] for run in found}) > 1
     body = []
     for run in found:
-        limit = f"{run['cost_limit']:g}"
-        line = [limit, run["method"]]
+        label = " ".join(word for word in run["label"].split() if not word.startswith("cost_limit="))
+        line = [*([run["task"]] if several else []), f"{run['cost_limit']:g}", label]
         for source in ("", OF_MEAN_ACTIONS):
             cost, reward = (np.array(run["table"][source + name], float) for name in ("cost", "reward"))
-            line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.0f}"]
+            line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
         body.append(line)
-    head = ["limit", "method", "seeds within", "cost", "reward"]
-    return markdown((*head, *(f"mean actions: {name}" for name in head[2:])), body)
+    about, measured = ["task", "limit", "method"][not several :], ["seeds within", "cost", "reward"]
+    return markdown((*about, *measured, *(f"mean actions: {name}" for name in measured)), body)
 
 
 KINDS: dict[str, Callable[[pathlib.Path], str]] = {

@@ -151,6 +151,7 @@ def test_workers_share_seeds_and_cpus():
         program.call()
 
 
+@pytest.mark.full
 def test_plain_loops_have_processes_that_end_with_their_program():
     before = multiprocessing.active_children()
     program = plain.plain_loop(Case("plain loop", "ant_2x4", threads=2))()
@@ -577,6 +578,7 @@ def test_an_overview_has_multipliers_with_pid_only(tmp_path: pathlib.Path):
     assert lane.endswith(" | - |") and " - " not in switch
 
 
+@pytest.mark.full
 def test_paths_of_ants_are_stored_and_drawn(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

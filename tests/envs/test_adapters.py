@@ -188,6 +188,7 @@ def test_gymnasiums_own_wrappers_accept_it(vectors):
                 assert obs in wrapped.observation_space, (name, mode)
 
 
+@pytest.mark.full
 def test_a_client_may_write_to_every_array_without_changing_what_comes(vectors):
     """`obs -= 1`, `reward[done] = 0` and the like are usual; a twin that is left alone shows the same afterwards."""
     for mode, env in vectors.items():
@@ -357,6 +358,7 @@ def test_every_task_can_be_pickled():
         pickle.loads(pickle.dumps(envs.make(name)))
 
 
+@pytest.mark.full
 def test_spaces_have_the_dtypes_of_arrays_in_64_bits_too():
     pytest.importorskip("pettingzoo")
     code = """
@@ -396,6 +398,7 @@ def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
     assert all(truncated.values()) and parallel.agents == [] and infos["agent_1"]["cost"] == [1]
 
 
+@pytest.mark.full
 def test_brax_wrappers_accept_a_task_and_say_what_it_says():
     pytest.importorskip("brax")
     from brax.envs.wrappers import training
@@ -441,6 +444,7 @@ def test_jaxmarl_gets_what_the_task_says_and_a_new_episode_in_the_same_step():
     assert team.get_world_state(state)[0] == obs["agent_0"][0] and team.world_state_size() == 6
 
 
+@pytest.mark.full
 def test_jaxmarl_ends_with_the_time_limit_and_cuts_actions_that_an_agent_lacks():
     team = adapters.to_jaxmarl(Uneven())
     assert [team.action_space(agent).shape for agent in team.agents] == [(2,), (1,)]
@@ -501,6 +505,7 @@ def test_brax_environments_that_cannot_be_used(metric: str, partition: str, said
         adapters.from_brax(adapters.to_brax(envs.make("lane")), metric, 1.0, partition=partition)
 
 
+@pytest.mark.full
 def test_a_missing_library_is_one_sentence_and_nothing_is_imported_before_it_is_asked_for():
     code = """
 import sys, envs, envs.adapters

@@ -103,6 +103,7 @@ def test_keys_of_resets_never_repeat():
     assert len(np.unique(np.concatenate(seen), axis=0)) == 20
 
 
+@pytest.mark.full
 def test_a_time_limit_that_terminates_leaves_nothing_to_bootstrap_from():
     """SafePO's convention: the same episodes, but their ends count as terminations."""
     env = envs.make("lane")

@@ -63,6 +63,7 @@ def test_ippo_of_one_agent_that_observes_the_state_is_mappo():
     chex.assert_trees_all_close(*states, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.full
 def test_critics_of_observations_see_nothing_of_other_agents():
     made = program("ippo_l")
     state = made.init(made.setup.hyper, jax.random.key(0))
@@ -85,6 +86,7 @@ def test_crpo_within_its_limit_is_happo():
     assert metrics["lambda"] == 1 and differ(weights(beyond)["actor"], weights(within)["actor"])
 
 
+@pytest.mark.full
 def test_an_agent_of_crpo_improves_its_cost_or_the_reward():
     setup, _, batch = acted()
     setup = dataclasses.replace(setup, method=METHODS["crpo"])
@@ -116,6 +118,7 @@ def test_a_multiplier_that_acts_makes_a_difference():
     assert differ(weights(trained("mappo_l")[0])["actor"], weights(trained("happo")[0])["actor"])
 
 
+@pytest.mark.full
 def test_pid_weighs_costs_by_three_terms():
     """A proportional gain weighs costs as a larger multiplier does, from the first update on."""
     plain, limit = program("mappo_l"), {"cost_limit": 8.0}
@@ -135,7 +138,8 @@ def test_pid_weighs_costs_by_three_terms():
     )
 
 
-@pytest.mark.parametrize("method", ["mappo_l", pytest.param("macpo", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["mappo_l", "macpo"])
 def test_a_margin_is_a_lower_limit_that_nobody_is_judged_by(method: str):
     """Also by an estimate that remembers what it began with: no excess."""
     kept, shown = trained(method, cost_limit=2.0, cost_margin=0.5)
@@ -205,6 +209,7 @@ def test_regret_weighs_a_trust_region_too(monkeypatch: pytest.MonkeyPatch):
     assert differ(updated("macpo_regret"), plain)
 
 
+@pytest.mark.full
 def test_regret_stands_still_where_nothing_ever_costs():
     setup, state, batch = acted()
     now = schedules.at(setup.config, setup.hyper, jnp.int32(0))

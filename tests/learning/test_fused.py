@@ -100,7 +100,10 @@ def sequences(count, steps, agents, width):
 
 
 # Widths of whole vectors and of parts of them; sequences that fill a task and that do not.
-@pytest.mark.parametrize(("count", "agents", "width"), [(8, (), 16), (7, (2,), 13), (1, (), 1), (13, (3,), 40)])
+@pytest.mark.parametrize(
+    ("count", "agents", "width"),
+    [(7, (2,), 13), *(pytest.param(*x, marks=pytest.mark.full) for x in ((8, (), 16), (1, (), 1), (13, (3,), 40)))],
+)
 def test_a_recurrent_unit_has_xlas_states_and_gradients(count, agents, width):
     given = sequences(count, 9, agents, width)
     with jax.default_matmul_precision("highest"):
@@ -166,7 +169,7 @@ def fitted(module, params, rows, key, learning_rate=1e-2, max_grad_norm=0.5):
     return fit(init_train_state(params), loss, rows, key, **limits, epochs=3, minibatches=2)
 
 
-@pytest.mark.parametrize("bound", [0.1, 10.0, np.inf])
+@pytest.mark.parametrize("bound", [0.1, *(pytest.param(x, marks=pytest.mark.full) for x in (10.0, np.inf))])
 def test_a_fit_ends_where_xlas_ends(by_xla, bound):
     module, params = network(7, (33, 16), 2, "elu")
     run = functools.partial(fitted, module, params, rows_of(), jax.random.key(3), max_grad_norm=bound)
@@ -175,6 +178,7 @@ def test_a_fit_ends_where_xlas_ends(by_xla, bound):
     assert jax.tree.structure(jax.jit(run)()) == jax.tree.structure(expected)
 
 
+@pytest.mark.full
 def test_weights_as_one_vector_end_where_a_tree_of_them_ends(by_xla, monkeypatch):
     module, params = network(7, (33, 16), 2, "elu")
     run = functools.partial(fitted, module, params, rows_of(), jax.random.key(3))

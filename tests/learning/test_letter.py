@@ -67,6 +67,7 @@ def replaying(count: int = 3) -> ReplayState:
     return dataclasses.replace(net, state=state, answer=jax.nn.sigmoid(answer), count=jnp.int32(count))
 
 
+@pytest.mark.full
 def test_the_loss_is_the_reversed_divergence_and_the_change_of_what_was_said_of_stored_states():
     _, batch = acted("f4sg_letter")
     net, key = replaying(), jax.random.key(7)
@@ -107,6 +108,7 @@ def test_each_agent_has_a_fear_network_that_learns_from_its_own_costs_alone():
     assert any(jnp.abs(x - y).max() > 1e-4 for x, y in zip(*map(jax.tree.leaves, second), strict=True))
 
 
+@pytest.mark.full
 @settings(max_examples=15, deadline=None)
 @given(updates=st.integers(1, 2 * letter.UPDATES + 1))
 def test_the_replay_buffer_has_the_latest_updates_and_nothing_is_drawn_that_was_never_stored(updates: int):
@@ -188,6 +190,7 @@ def test_regret_is_drawn_to_the_density_by_its_own_divergence():
     np.testing.assert_allclose(slope(jnp.log(lowest / (1 - lowest))), 0.0, atol=1e-6)
 
 
+@pytest.mark.full
 def test_the_loss_of_regret_is_its_divergence_from_the_density_over_costly_steps():
     state, batch = acted("r4sg_letter")
     hyper = R4SG.hyper(emotion_lr=0.0)
@@ -227,6 +230,7 @@ def test_the_weight_has_no_bound_and_no_padding():
     assert jnp.isfinite(letter.log_weight(jnp.asarray([200.0]), jnp.zeros(1), jnp.ones(1), jnp.ones(1), jnp.inf))
 
 
+@pytest.mark.full
 def test_the_weight_moves_in_the_epochs():
     state, batch = acted("r4sg_letter")
     net, weights, _ = appraise("regret")(R4SG.setup.hyper, state.regret, batch, jax.random.key(7))
@@ -335,6 +339,7 @@ def test_a_run_with_settings_that_are_not_the_papers_says_so():
     assert whole == plain == [] and "gae_lambda = 0.95 (the paper: 1.0)" in part[0] and "--preset letter" in part[0]
 
 
+@pytest.mark.full
 def test_both_together_are_a_row_of_your_own(monkeypatch: pytest.MonkeyPatch):
     both = dataclasses.replace(METHODS["f4sg_letter"], ratio_weight="regret")
     monkeypatch.setitem(METHODS, "mixed_letter", both)

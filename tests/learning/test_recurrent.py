@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.base import EnvSpec, State
 from pmt_jax import evaluate, load_config, load_policy, make_setup, make_train
 from pmt_jax.learning import critics, learner, policies
 from pmt_jax.learning.maths import gru, running_moments
@@ -25,9 +26,70 @@ from pmt_jax.learning.types import Batch, LearnerState, Tag
 from pmt_jax.policies import hub, load, numpy_policy, onnx_policy
 from pmt_jax.policies.export import weights
 from pmt_jax.render import episode
-from recall import LIMIT, OPTIMUM, WITHOUT_MEMORY, Recall
 from runs import assert_same_run, rows, saved, stop_after_rows
 from small import SMALL
+
+STEPS = 8
+LIMIT = 1.0
+OPTIMUM = float(STEPS)  # away from the danger in every step
+# A policy without memory knows the side in the first step alone. In any other, whatever it does, half of the episodes
+# have the danger on the side that it takes: a step that moves earns at most 1 and costs 1/2 in the mean, one that stays
+# at 0 earns and costs nothing. With a cost of at most LIMIT an episode, 2 * LIMIT steps move besides the first.
+WITHOUT_MEMORY = 1 + 2 * LIMIT
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Carry:
+    """side [] -1 or 1, where the danger is; time [] int32."""
+
+    side: jax.Array
+    time: jax.Array
+
+
+class Recall:
+    """Two agents move a point along a line, u = mean of their actions in [-1, 1], and it returns to 0 after each step.
+
+    The reward is abs(u), on either side. One side is dangerous for the whole episode: there a step costs 1.
+    Observations and the state show the side in the first step alone, and the time.
+    """
+
+    engine = "xla"
+    shares_cost = True
+
+    def __init__(self) -> None:
+        self.spec = EnvSpec(
+            name="recall",
+            num_agents=2,
+            obs_dim=4,
+            action_dim=1,
+            state_dim=2,
+            num_costs=1,
+            horizon=STEPS,
+            action_mask=np.ones((2, 1), np.float32),
+            cost_limit=LIMIT,
+        )
+
+    def reset(self, key: jax.Array) -> State:
+        side = jnp.where(jax.random.bernoulli(key), 1.0, -1.0)
+        return self._state(Carry(side, jnp.int32(0)), jnp.zeros(()))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        carry = dataclasses.replace(state.carry, time=state.carry.time + 1)
+        return self._state(carry, jnp.clip(action, -1.0, 1.0).mean())
+
+    def _state(self, carry: Any, u: jax.Array) -> State:
+        seen = jnp.stack([jnp.where(carry.time == 0, carry.side, 0.0), carry.time / STEPS])
+        return State(
+            obs=jnp.concatenate([jnp.broadcast_to(seen, (2, 2)), jnp.eye(2)], axis=1),
+            global_state=seen,
+            reward=jnp.abs(u),
+            cost=jnp.broadcast_to(u * carry.side > 0, (2, 1)).astype(u.dtype),
+            terminated=jnp.asarray(False),
+            info={"u": u},
+            carry=carry,
+        )
+
 
 GRU = {**SMALL, "recurrent": "gru", "rollout_length": 20, "steps": 8 * 20 * 2, "minibatches": 2}
 ARGUMENTS = ("lane", "--recurrent", "gru", "--num-envs", 4, "--rollout-length", 20, "--log-interval", 2, "--hidden", 8)
@@ -119,6 +181,7 @@ def test_sequences_give_the_policy_that_acted(method: str):
     assert apart[0] > 1e-4 and apart[4:].max() < 1e-5  # until the first episode ends
 
 
+@pytest.mark.full
 @METHODS
 def test_critics_remember_as_step_after_step(method: str):
     setup, before, after, batch = acted(method)
@@ -203,6 +266,7 @@ def test_only_a_policy_that_remembers_comes_near_the_optimum():
 # Runs, and what is made of them
 
 
+@pytest.mark.full
 def test_resumed_within_an_episode_bit_for_bit(trained: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     out = tmp_path / "run"
     stop_after_rows(monkeypatch, signal.SIGTERM)
@@ -214,6 +278,7 @@ def test_resumed_within_an_episode_bit_for_bit(trained: pathlib.Path, tmp_path: 
     assert_same_run(out, trained)
 
 
+@pytest.mark.full
 def test_policies_loaded_exported_and_drawn_act_as_the_one_that_was_evaluated(
     trained: pathlib.Path, tmp_path: pathlib.Path, cli
 ):
@@ -275,6 +340,7 @@ def test_weights_in_numpy_and_onnx_for_every_kind_of_network(changes: dict, tmp_
         onnx_policy.check(tmp_path / "policy.onnx", [obs, hidden], [np.asarray(mean), np.asarray(after)])
 
 
+@pytest.mark.full
 def test_a_policy_in_the_hub(trained: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(hub, "FOLDER", tmp_path)
     run, _, state = load.load_seed(trained, 1)

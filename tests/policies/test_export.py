@@ -20,6 +20,7 @@ from pmt_jax.policies import load, numpy_policy, onnx_policy
 from pmt_jax.policies.export import weights
 
 
+@pytest.mark.full
 def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
     run, state = load.load_run(whole)
     obs = jax.random.normal(jax.random.key(0), (5, 2, 8)) * 3
@@ -85,8 +86,8 @@ def test_onnx_without_its_extra(whole: pathlib.Path, tmp_path: pathlib.Path, cli
     "changes",
     [
         {"method": "mappo", "layer_norm": True, "activation": "elu"},
-        {"obs_norm": "layernorm", "layer_norm": True, "activation": "relu"},
-        {"obs_norm": "layernorm", "layer_norm": False},
+        pytest.param({"obs_norm": "layernorm", "layer_norm": True, "activation": "relu"}, marks=pytest.mark.full),
+        pytest.param({"obs_norm": "layernorm", "layer_norm": False}, marks=pytest.mark.full),
         {"obs_norm": "none", "hidden": [8, 4]},
     ],
 )

@@ -57,6 +57,7 @@ def test_networks_and_moments_are_the_other_runs_and_all_else_is_new(whole: path
         chex.assert_trees_all_equal(getattr(state, name), getattr(fresh, name))
 
 
+@pytest.mark.full
 def test_a_pretrained_policy_brings_what_acts():
     setup, fresh = first("ant_2x4", hidden=(128, 128), init="hub:ant_2x4/f4sg")
     state, (_, pretrained) = started(setup, fresh), load.load_run(pathlib.Path("hub:ant_2x4/f4sg"))
@@ -64,6 +65,7 @@ def test_a_pretrained_policy_brings_what_acts():
     chex.assert_trees_all_equal(state.critic, fresh.critic)
 
 
+@pytest.mark.full
 def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     out = tmp_path / "run"
     assert cli("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)[0] == 0
@@ -71,6 +73,7 @@ def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp
     assert rows(out)[0]["fear/loss"] != rows(whole)[0]["fear/loss"]
 
 
+@pytest.mark.full
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
     whole: pathlib.Path, tmp_path: pathlib.Path, cli
 ):

@@ -78,6 +78,7 @@ def floats(packed: str, *shape: int) -> np.ndarray:
 # Episodes
 
 
+@pytest.mark.full
 def test_a_recorded_episode_is_what_the_environment_did(whole: pathlib.Path):
     shown = episode.record_run(whole, seed=1, number=2, deterministic=True)
     assert len(shown) == 26 and shown.seed == 1
@@ -220,6 +221,7 @@ def test_a_film_of_the_grid(grid: episode.Episode, tmp_path: pathlib.Path, monke
     assert [p.name for p in tmp_path.iterdir()] == ["grid.gif"]
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="which OpenGL there is depends on the machine")
 def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeypatch):
     """With OpenGL, the picture is red where it costs; without, a sentence names the way out."""

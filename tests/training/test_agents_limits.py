@@ -102,6 +102,7 @@ def run(file: pathlib.Path) -> pathlib.Path:
     return out
 
 
+@pytest.mark.full
 def test_a_row_names_each_agent(run: pathlib.Path):
     """Agent 0 costs 18 of an allowed 10 (8 with the margin), agent 1 nothing; their mean is within the limit."""
     for found in rows(run):
@@ -117,6 +118,7 @@ def test_a_row_names_each_agent(run: pathlib.Path):
     assert last["lambda"] == pytest.approx((last["lambda/agent_0"] + last["lambda/agent_1"]) / 2)
 
 
+@pytest.mark.full
 def test_tables_and_the_console_say_that_the_limit_is_violated(run: pathlib.Path, cli):
     (data,) = json.loads(cli("table", run, "--format", "json")[1])["rows"]
     assert (data["within"], data["worst"], data["cost_limit"]) == (0, 18, 10)
@@ -133,6 +135,7 @@ def test_tables_and_the_console_say_that_the_limit_is_violated(run: pathlib.Path
         assert re.search(rf"^  {name} +{mean}\.0000 ", text, re.MULTILINE)
 
 
+@pytest.mark.full
 def test_a_run_is_compared_by_its_worst_agent(run: pathlib.Path, tmp_path: pathlib.Path, cli):
     other = tmp_path / "other"
     other.mkdir()
@@ -142,18 +145,21 @@ def test_a_run_is_compared_by_its_worst_agent(run: pathlib.Path, tmp_path: pathl
     assert "worst agent (limit 10)  18 [-]" in text and "seeds within the limit  0 of 1" in text
 
 
+@pytest.mark.full
 def test_the_state_that_is_kept_as_best_was_judged_by_the_worst_agent(run: pathlib.Path):
     """None is within, so that its excess is kept, by which later states are judged."""
     saved = run_folder.load_saved(run)[2]
     assert saved["best"].cost == pytest.approx([8.0])
 
 
+@pytest.mark.full
 def test_a_picture_sums_the_cost_of_the_agent_who_has_most(run: pathlib.Path):
     with trusting():
         shown = episode.record_run(run)
     assert shown.cost_sum[-1] == 18 and str(shown.limits) == "10" and shown.cost.max() == 0.5
 
 
+@pytest.mark.full
 def test_the_policy_that_is_published_keeps_every_agent_within(file: pathlib.Path, tmp_path: pathlib.Path):
     """Of one that pushes with agent 0 alone (25 of an allowed 15, mean 12.5) and one that does not push, the second."""
     config = load_config(f"{file}:Pushes", method="mappo_l", num_envs=4, hidden=[8], cost_limit=15)
@@ -216,7 +222,7 @@ def test_a_task_that_only_says_that_its_agents_share_costs_is_refused_or_stops(f
     assert not [name for name in rows(tmp_path / "run")[0] if "spread" in name or "agent_0" in name]
 
 
-@pytest.mark.parametrize("task", ["lane", "switch", "noisy"])
+@pytest.mark.parametrize("task", ["lane", *(pytest.param(x, marks=pytest.mark.full) for x in ("switch", "noisy"))])
 def test_agents_that_share_costs_have_one_column(task: str):
     setup = make_setup(load_config(task, method="f4sg", num_envs=2, hidden=[8]))
     state = jax.eval_shape(lambda: learner.init(setup, setup.hyper, jax.random.key(0)))

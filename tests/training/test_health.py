@@ -43,6 +43,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch, updates: dict[int, int]) -> None:
     monkeypatch.setattr(trainer, "compile_run", compile_breaking)
 
 
+@pytest.mark.full
 def test_one_seed_breaks_and_the_other_trains_on(whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch):
     breaking(monkeypatch, {1: 10})
     out = tmp_path / "run"

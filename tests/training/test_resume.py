@@ -15,13 +15,15 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from pmt_jax import load_config, load_policy
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
 from pmt_jax.studies import run_log
-from pmt_jax.training import checkpoint, loggers, run_folder, trainer
-from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, stop_after_rows
+from pmt_jax.training import checkpoint, chunks, loggers, run_folder, trainer
+from runs import ARGUMENTS, STEPS, TINY, assert_same_run, environment, rows, stop_after_rows
 
 DIES = """
 import os, signal, sys
@@ -61,7 +63,7 @@ def test_killed_in_the_middle_of_a_save_and_resumed_is_as_if_nothing_had_happene
     assert not list((out / "checkpoints").glob("*tmp"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.full)])
 def test_a_signal_saves_and_the_command_continues(
     number: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
 ):
@@ -172,13 +174,15 @@ def test_metrics_that_were_cut_off_before_the_checkpoint(copy: pathlib.Path, cli
     metrics = copy / "metrics.jsonl"
     text = metrics.read_text()
     metrics.write_text(text[: len(text) // 2])
-    code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", STEPS + 200)
+    shutil.rmtree(copy / "checkpoints" / str(STEPS))
+    code, text, _ = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
     assert code == 0 and "changed since the run began: jax 0.1 -> " in text
-    assert f"{metrics} lacks 8 of 16 rows up to step 1,600: 4 of seed 0 (between steps 1,000 and 1,600), 4 of" in text
+    assert f"{metrics} lacks 6 of 14 rows up to step 1,400: 3 of seed 0 (between steps 1,000 and 1,400), 3 of" in text
     steps = [row["step"] for row in rows(copy)]
-    assert steps[-1] == STEPS + 200 and 1000 not in steps
+    assert steps[-1] == STEPS and 1000 not in steps
 
 
+@pytest.mark.full
 def test_fewer_steps_than_are_done_change_nothing(copy: pathlib.Path, cli):
     before = {path.name: path.read_bytes() for path in copy.glob("*.*")}
     code, text, _ = cli("train", *ARGUMENTS, "--steps", 400, "--out", copy, "--resume")
@@ -201,7 +205,7 @@ def test_fewer_steps_than_are_done_change_nothing(copy: pathlib.Path, cli):
 def test_a_row_that_is_none_of_a_run(row: str, copy: pathlib.Path, cli):
     metrics = copy / "metrics.jsonl"
     metrics.write_text(before := metrics.read_text() + row + "\n")
-    code, _, err = cli("train", *ARGUMENTS, "--steps", STEPS + 200, "--out", copy, "--resume")
+    code, _, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", copy, "--resume")
     assert code == 2 and f"{metrics} holds a row with" in err and "delete that line" in err and err.count("\n") == 1
     assert metrics.read_text() == before and not (copy / ".lock").exists()
 
@@ -215,6 +219,7 @@ def test_resuming_where_another_engine_would_simulate(copy: pathlib.Path, cli):
     assert "was simulated by engine 'warp', but physics = auto means 'xla' on this cpu" in err
 
 
+@pytest.mark.full
 def test_folders_that_can_only_be_read(whole: pathlib.Path, small_disk, cli):
     place, remount = small_disk
     out = place / "run"
@@ -245,6 +250,7 @@ def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Pat
     assert run_log.read(copy).identity != run_log.read(whole).identity
 
 
+@pytest.mark.full
 def test_a_run_that_has_ended_says_what_would_train(copy: pathlib.Path, cli):
     """It would drop the other settings otherwise."""
     command = ("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache")
@@ -269,3 +275,87 @@ def test_what_cannot_change(words: tuple, said: str, copy: pathlib.Path, cli):
     code, _, err = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--change", *words)
     assert code == 2 and said in err and "Traceback" not in err
     assert (copy / "config.toml").read_text() == before and not (copy / "changes.jsonl").exists()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Chunks end soon, whatever a row is, and no number depends on where they end
+
+
+LONG = ("lane", *TINY, "--method", "mappo", "--seeds", 2, "--no-cache")
+LONG += ("--log-interval", 10**6, "--steps", 1400)  # one row, of 14 updates
+relaxed = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@relaxed
+@given(
+    interval=st.integers(1, 10**7),
+    updates=st.integers(1, 300),
+    speeds=st.lists(st.floats(0, 1e4), min_size=1, max_size=9),
+)
+def test_a_plan_covers_every_update_once_and_ends_soon(interval: int, updates: int, speeds: list[float]):
+    config = load_config("lane", num_envs=2, rollout_length=5, minibatches=1, steps=10 * updates, log_interval=interval)
+    assert config.num_updates == updates
+    done, seconds, ends = 0, None, []
+    while done < updates:
+        n, end = chunks.plan(config, done, seconds), chunks.row_end(config, done)
+        assert 1 <= n <= min(end - done, chunks.most(config))
+        assert n == 1 if seconds is None else n == 1 or n * seconds <= chunks.SECONDS
+        done, seconds = done + n, speeds[done % len(speeds)]
+        ends += [done] if done == end else []
+    assert ends == [*range(interval, updates, interval), updates]
+
+
+def test_steps_are_not_multiplied_by_the_interval():
+    for interval in (1, 3, 7, 10**6):
+        sizes = {"num_envs": 8, "rollout_length": 25, "minibatches": 1, "log_interval": interval}
+        assert load_config("lane", steps=2000, **sizes).num_updates == 10
+        assert load_config("lane", steps=2001, **sizes).num_updates == 11
+
+
+@relaxed
+@given(cuts=st.lists(st.integers(1, 5), min_size=1, max_size=6), room=st.integers(0, 3))
+def test_a_row_is_the_same_however_it_is_cut(cuts: list[int], room: int):
+    loss = np.random.default_rng(0).normal(size=(2, sum(cuts))).astype(np.float32)
+    row, done = chunks.OpenRow(), 0
+    for n in cuts:
+        padded = np.concatenate([loss[:, done : done + n], np.zeros((2, room), np.float32)], axis=1)
+        done += n
+        row = row.then(n, {"loss": padded, "finite": np.array([True, done < sum(cuts)])})
+        assert chunks.OpenRow.of(row.metrics).updates == row.updates == done
+    np.testing.assert_array_equal(row.metrics["loss"], loss)
+    assert row.metrics["finite"].tolist() == [True, False]
+
+
+@pytest.mark.parametrize("length", [1, pytest.param(2, marks=pytest.mark.full)])
+def test_rows_and_states_do_not_depend_on_the_chunks(
+    length: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, monkeypatch
+):
+    """`whole` had one update first, as nothing was known of its speed, and then what was left of each row."""
+    monkeypatch.setattr(chunks, "plan", lambda config, done, _: min(length, chunks.row_end(config, done) - done))
+    assert cli("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")[0] == 0
+    assert_same_run(tmp_path / "run", whole)
+
+
+@pytest.mark.full
+def test_a_run_that_is_stopped_within_a_row_goes_on_with_the_row(tmp_path: pathlib.Path, cli, monkeypatch):
+    """Of a row as long as the run, in chunks of 5 updates and, stopped after the second and fourth, of 3."""
+    monkeypatch.setattr(chunks, "plan", lambda config, done, _: min(5, 14 - done))
+    assert cli("train", *LONG, "--out", tmp_path / "whole")[0] == 0
+    assert [row["step"] for row in rows(tmp_path / "whole")] == [1400, 1400]
+
+    def plan(config: object, done: int, _: object) -> int:
+        if done in (3, 9):
+            signal.raise_signal(signal.SIGTERM)
+        return min(3, 14 - done)
+
+    monkeypatch.setattr(chunks, "plan", plan)
+    command = ("train", *LONG, "--out", tmp_path / "run")
+    code, text, _ = cli(*command)
+    assert code == 128 + signal.SIGTERM and "interrupted after 600 steps; saved" in text
+    assert rows(tmp_path / "run") == []
+    code, text, _ = cli(*command, "--resume")
+    assert code == 128 + signal.SIGTERM and "resuming after 600 steps" in text and "lost" not in text
+    code, text, _ = cli(*command, "--resume")
+    assert code == 0 and "resuming after 1,200 steps" in text
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
+    assert cli("eval", tmp_path / "run", "--episodes", 2)[0] == 0

@@ -184,6 +184,7 @@ def test_spec_and_observation(name, agents, width):
     np.testing.assert_array_equal(raw.obs[:, 29:], np.eye(agents))
 
 
+@pytest.mark.full
 def test_agents_drive_the_motors_in_order():
     """The effective partition: agents' actions concatenated, whatever the reference's table declares."""
     two, four = (envs.make(name, physics="mujoco") for name in ("ant_2x4", "ant_4x2"))
@@ -194,6 +195,7 @@ def test_agents_drive_the_motors_in_order():
     np.testing.assert_allclose(a.info["reward_ctrl"], -0.5 * np.sum(np.asarray(action) ** 2), rtol=1e-6)
 
 
+@pytest.mark.full
 def test_free_partitions_drive_the_motors_that_they_name():
     two = envs.make("ant_2x4", physics="mujoco")
     free = envs.make("ant_2x4", physics="mujoco", partition="0,7,2,3,4,5|6,1")
@@ -315,7 +317,7 @@ def test_an_ant_behind_a_wall_is_outside_and_behind_the_band_reference_walls_cos
     np.testing.assert_array_equal(after.cost[:, 0, 0], costs)
 
 
-@pytest.mark.parametrize("kind", ["costly", "solid"])
+@pytest.mark.parametrize("kind", [pytest.param("costly", marks=pytest.mark.full), "solid"])
 def test_away_from_walls_every_kind_of_wall_is_the_reference(kind):
     """Equal to the last bit where no foot can touch a wall, and for costly walls everywhere but in the cost outside."""
     rows = recording("ant_2x4")
@@ -351,7 +353,9 @@ def flight(kind: str, steps: int = 30) -> list:
     return states
 
 
-@pytest.mark.parametrize(("kind", "furthest"), [("costly", (5.5, 30)), ("solid", (3.5, 4.9))])
+@pytest.mark.parametrize(
+    ("kind", "furthest"), [pytest.param("costly", (5.5, 30), marks=pytest.mark.full), ("solid", (3.5, 4.9))]
+)
 def test_solid_walls_stop_an_ant_that_others_let_through(kind, furthest):
     """A torso of radius 0.25 touches a wall at 30 degrees 0.29 m (along y) before its centre would reach it."""
     places = np.stack([state.carry.torso_xpos[:, :2] for state in flight(kind)])
@@ -398,6 +402,7 @@ def test_solid_walls_leave_no_gap():
             assert (inside == blocked).all()
 
 
+@pytest.mark.full
 def test_a_corridor_that_sways_costs_where_it_is_and_is_seen_there():
     """A quarter of a period after phase 0 the centre line is a metre aside; what is hidden is only the observation."""
     far = centre(5.0) + 2.7  # from a line that stands still: half a metre inside of the danger band
@@ -416,6 +421,7 @@ def test_a_corridor_that_sways_costs_where_it_is_and_is_seen_there():
             assert float(after.cost[0, 0]) == costs
 
 
+@pytest.mark.full
 def test_a_sway_moves_nothing_but_the_line():
     """The same ant and the same physics; two resets have two phases."""
     still, moving = envs.make("ant_2x4", physics="mujoco"), swaying("hidden")

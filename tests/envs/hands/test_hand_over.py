@@ -109,6 +109,7 @@ def test_objects_and_the_hand_s_own_contacts(thing, mass):
     assert np.isfinite(data.qpos).all()
 
 
+@pytest.mark.full
 def test_reset_draws_what_the_task_says():
     state = starts()
     qpos = np.asarray(state.carry.physics.qpos)

@@ -27,7 +27,7 @@ from native import compiled
 from paths import DATA
 
 NAMES = [f"multi_goal_{variant}" for variant in VARIANTS]
-# By default, both robots, hazards, vases with and without a cost, slots, on the engine that compiles nothing.
+# Both robots, hazards, vases with and without a cost, slots, on the engine that compiles nothing; by default, the ant.
 POINT_2 = ("multi_goal_point_2", "mujoco")
 DEFAULT = (POINT_2, ("multi_goal_ant_1", "mujoco"))
 FULL = (("multi_goal_point_0", "mujoco"), ("multi_goal_point_2", "fused"), ("multi_goal_ant_2", "fused"))
@@ -37,7 +37,7 @@ NEW, OLD = (2e-5, 5e-4, 2e-5, 5e-4, 1e-4, 1e-3), (2e-5, 5e-4, 1e-4, 1e-2, 1e-4, 
 MJX = (5e-5, 5e-3, 1e-4, 1e-2, 2e-4, 5e-2)
 
 
-def each(default: tuple[tuple[str, str], ...] = DEFAULT):
+def each(default: tuple[tuple[str, str], ...] = DEFAULT[1:]):
     both = [(name, engine) for name in NAMES for engine in ("fused", "mujoco")]
     skips = {"fused": (compiled,), "mujoco": ()}
     late = {each: pytest.mark.full if each in (*FULL, *DEFAULT) else pytest.mark.slow for each in both}
@@ -223,6 +223,7 @@ def stepped(task, action=0.0, hazard=(1.8, 1.8), qpos=None, qvel=None, owner=0):
 THRUST = [[1.0, -1.0], [0.0, 0.0]]
 
 
+@pytest.mark.full
 def test_agents_of_the_reference_share_the_points_motors():
     qvel = stepped(made(*POINT_2), THRUST).carry.physics.qvel
     assert qvel[0] > 1e-3 and qvel[3] < -1e-3 and abs(qvel[2]) < 1e-6  # agent 0 drives both, agent 1 turns none
@@ -289,7 +290,7 @@ def test_observations_are_standardised_over_their_own_entries():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("agents", [2, 5])
+@pytest.mark.parametrize("agents", [2, 3])
 def test_own_robots_see_each_other_and_pay_for_touching(agents):
     env, _, step, reset = own(agents)
     start = reset(jax.random.split(jax.random.key(2), 64))
@@ -304,7 +305,7 @@ def test_own_robots_see_each_other_and_pay_for_touching(agents):
     nearest = np.maximum(0, 1 - apart.min(1) / 3)
     np.testing.assert_allclose(shown[:, where["lidar of other robots"]].max(1), nearest, atol=1e-5)
     goal = np.linalg.norm(places[:, :2] - np.asarray(state.carry.goals), axis=1)
-    np.testing.assert_allclose(shown[:, where["lidar of own goal"]].max(1), 1 - goal / 3, atol=1e-5)
+    np.testing.assert_allclose(shown[:, where["lidar of own goal"]].max(1), np.maximum(0, 1 - goal / 3), atol=1e-5)
     qpos = start.carry.physics.qpos
     physics = dataclasses.replace(start.carry.physics, qpos=qpos.at[:, 3:5].set(qpos[:, :2] + 0.1))
     carry = dataclasses.replace(start.carry, physics=physics)
@@ -312,6 +313,7 @@ def test_own_robots_see_each_other_and_pay_for_touching(agents):
     assert (touching.cost[:, :2, 1] == 1).all() and (touching.info["cost_contact_other_1"] == 1).all()
 
 
+@pytest.mark.full
 def test_what_mujoco_calls_a_contact_is_what_counts():
     """Random points and vases: geoms overlap exactly where the engine lists contacts."""
     model = models.model("point", 2, 10, 2.0)
@@ -419,6 +421,7 @@ def test_auto_takes_fused_where_it_has_room():
 VIOLET = HAZARD_COLOUR[:3]
 
 
+@pytest.mark.full
 def test_a_picture_shows_goals_hazards_lidars_and_who_pays():
     env, *_ = made(*POINT_2)
     paying = stepped(made(*POINT_2), hazard=(-1.6, -1.5))

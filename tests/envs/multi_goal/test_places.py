@@ -46,7 +46,9 @@ def least_slack(places: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray
     return slack[:, others][:, :, others].min((1, 2)), (apart[:, 1, others] - radius[others] - last).min(1)
 
 
-@pytest.mark.parametrize("number", [0, 1, 2])
+@pytest.mark.parametrize(
+    "number", [pytest.param(0, marks=pytest.mark.full), pytest.param(1, marks=pytest.mark.full), 2]
+)
 def test_layouts_keep_the_rules_and_look_like_the_recorded_ones(number):
     (ours, crowded), theirs = drawn(number), recorded(number)
     level = LEVELS[number]

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from batches import assert_batches_agree, assert_same
 from envs import physics
 from envs.ant import corridor, walls
 from envs.errors import TaskError
@@ -23,6 +22,7 @@ from envs.physics import contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
 from native import compiled
 from paths import ROOT
+from stepping import assert_batches_agree, assert_same
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 PLAIN = {"torso": ("xpos", 1), "motors": ("qfrc_actuator", slice(6, 14, 2))}

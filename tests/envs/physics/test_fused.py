@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import envs
-from batches import assert_batches_agree, assert_same
 from envs import native, physics
 from envs.ant import walls
 from envs.errors import TaskError
@@ -36,6 +35,8 @@ from pmt_jax import tasks
 from stepping import (
     answers,
     anywhere,
+    assert_batches_agree,
+    assert_same,
     by_c,
     by_robot,
     check,
@@ -217,7 +218,7 @@ SERVOS = """<position joint='h' kp='2' kv='.1' forcerange='-1 1'/><velocity join
 CONTACTS = dict(zip(list(SMALL)[3:], (2, 2, 1, 1, 2, 2, 2, 1, 14, 5), strict=True))  # of the reference pose
 
 
-THIN_SMALL = (4, 10)  # the default tests of the other schedule have most of the rest
+THIN_SMALL = (10,)  # the default tests of the other schedule have most of the rest
 
 
 @pytest.mark.parametrize(
@@ -262,6 +263,7 @@ def engine(**options):
     return physics.make_engine(walls.model(), substeps=5, readout=readout, physics="fused", **options)
 
 
+@pytest.mark.full
 def test_numbers_do_not_depend_on_threads_order_or_neighbours():
     state, ctrl = ants(37)
     lone = jax.jit(jax.vmap(engine(threads=1).step))(state, ctrl)
@@ -293,6 +295,7 @@ def test_no_world_depends_on_its_neighbours(robot, others):
     assert np.isnan(again["qpos"][~whole]).all()
 
 
+@pytest.mark.full
 def test_single_precision_outside_costs_half_a_micrometre():
     """Numbers inside are double, whatever the arrays are."""
     rows = states("corridor", "visited").astype(np.float32)
@@ -345,6 +348,7 @@ CROWDED = """<mujoco><worldbody><geom type='plane' size='9 9 1'/><geom type='box
   <body pos='.3 0 .5'><joint type='slide' axis='0 0 1'/><geom size='.1'/></body></worldbody></mujoco>"""
 
 
+@pytest.mark.full
 def test_more_contacts_than_there_is_room_for_are_reported():
     """With the floor, with a box, and with one another."""
     model = mujoco.MjModel.from_xml_string(CROWDED)
@@ -528,6 +532,7 @@ def test_compilers_are_asked_in_the_order_of_the_readme(fresh, monkeypatch):
     assert [compiler.version for compiler in native.compilers()] == 4 * ["fake 1.0"] + ["clang of zig"]
 
 
+@pytest.mark.full
 def test_flags_of_the_chosen_compiler_have_the_last_word(small_library, fresh, monkeypatch):
     told = fresh.parent / "told"
     says = 'case "$*" in *--version) echo "fake 1.0"; exit 0;; esac\n'
@@ -645,6 +650,7 @@ def test_processes_that_compile_at_once_both_step(tmp_path):
     assert [path.suffix for path in folder.iterdir() if path.name != "zig"] == [".so"]
 
 
+@pytest.mark.full
 def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path):
     (tmp_path / "file").touch()  # no folder can be made below it, not even by root
     out, error = started(XDG_CACHE_HOME=str(tmp_path / "file")).communicate(timeout=300)

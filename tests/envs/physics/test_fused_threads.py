@@ -76,7 +76,7 @@ def test_accelerations_steps_and_readouts_are_mujocos(robot, kind, full):
 
 
 @compiled
-@pytest.mark.parametrize("robot", by_robot("hopper"))
+@pytest.mark.parametrize("robot", by_robot())
 def test_single_precision_is_close(robot):
     model, made_of = made(robot)
     rows = states(robot, kinds(robot)[0]).astype(np.float32).astype(float)
@@ -217,7 +217,11 @@ def at_a_box(model: mujoco.MjModel, count: int) -> np.ndarray:
 
 @compiled
 @pytest.mark.parametrize(
-    "size", [".5 .3 .2", *(pytest.param(x, marks=pytest.mark.slow) for x in (".1 .1 .1", "300 .5 .7"))]
+    "size",
+    [
+        pytest.param(".5 .3 .2", marks=pytest.mark.full),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in (".1 .1 .1", "300 .5 .7")),
+    ],
 )
 def test_capsules_and_spheres_touch_a_box_as_in_c(size):
     model = exact(mujoco.MjModel.from_xml_string(AT_A_BOX.format(size=size)))

@@ -75,6 +75,7 @@ def test_dtypes(call, dtype):
     np.testing.assert_array_equal(out, expected(x))
 
 
+@pytest.mark.full
 def test_wide_dtypes():
     done = run("""
         import jax, jax.numpy as jnp, numpy as np
@@ -234,6 +235,7 @@ def test_large_batches_among_matmuls_and_threads_do_not_deadlock(cpus):
     assert done.stdout.strip() == "ok", done.stderr
 
 
+@pytest.mark.full
 def test_programs_with_calls_are_cached_on_disk(tmp_path):
     script = """
         import jax, jax.numpy as jnp

@@ -76,13 +76,13 @@ def check_replay(name: str, physics: str) -> None:
     np.testing.assert_array_equal(after.terminated, rows["terminated"])
 
 
-@each()
+@each("velocity_humanoid_9_8")
 def test_reproduces_the_recorded_steps(name):
     check_replay(name, "mujoco")
 
 
 ON_FUSED = {
-    "velocity_hopper_3x1": (),
+    "velocity_hopper_3x1": pytest.mark.full,
     "velocity_swimmer_2x1": pytest.mark.full,
     "velocity_humanoid_9_8": pytest.mark.full,
 }
@@ -108,7 +108,7 @@ def test_reproduces_the_recorded_steps_on_warp(name):
     check_replay(name, "warp")
 
 
-@each()
+@each("velocity_humanoid_9_8")
 def test_reproduces_the_recorded_resets(name):
     rows, (_, restore, _) = recording(name), made(name)
     state = restore(rows["reset_qpos"], rows["reset_qvel"])
@@ -159,6 +159,7 @@ def test_padding_of_unequal_agents_is_ignored():
     np.testing.assert_array_equal(after.info["reward_ctrl"], [0.0, 0.0])
 
 
+@pytest.mark.full
 def test_any_partition_drives_the_same_robot():
     whole = envs.make("velocity_half_cheetah_2x3", partition=((5, 4, 3, 2, 1), (0,)), **PLAIN)
     halves = envs.make("velocity_half_cheetah_2x3", **PLAIN)
@@ -188,6 +189,7 @@ def test_costs_of_speed():
     assert moving_at(cheetah(threshold=2.0, cost="excess"), 1.0).cost.tolist() == [[0], [0]]
 
 
+@pytest.mark.full
 def test_falling_as_a_second_cost():
     env = envs.make("velocity_hopper_3x1", fall_cost=True, physics="mujoco")
     assert env.spec.num_costs == 2 and env.spec.cost_limit == (25.0, 0.1)

@@ -40,7 +40,7 @@ def worst(ours: np.ndarray, theirs: np.ndarray) -> float:
     [
         ("full_nonoise", {}, "float64", 1e-7),
         pytest.param("full_nonoise", {}, "float32", 1e-5, marks=pytest.mark.full),
-        ("bowl", {"barrier": "bowl"}, "float64", 1e-7),
+        pytest.param("bowl", {"barrier": "bowl"}, "float64", 1e-7, marks=pytest.mark.full),
         pytest.param("history3", {"history": 3}, "float32", 1e-5, marks=pytest.mark.full),
     ],
 )
@@ -87,6 +87,7 @@ def first(env, **raw):
     return jax.jit(env.restore)(**{"start_row": 603, "q": np.zeros(env.spec.num_agents), **raw})
 
 
+@pytest.mark.full
 def test_specs_are_mapdns() -> None:
     small, large = envs.make("voltage_33").spec, envs.make("voltage_141").spec
     assert (small.num_agents, small.obs_dim, small.state_dim, small.horizon) == (6, 50, 144, 239)
@@ -108,6 +109,7 @@ def test_raw_is_the_inverse_of_restore_in_mid_episode_and_with_noise() -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.full
 def test_reset_is_within_the_data_and_differs_by_key() -> None:
     env = folder_env()
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 200))
@@ -172,6 +174,7 @@ def test_actions_are_clipped_and_scaled() -> None:
     np.testing.assert_allclose(edge.carry.q, 0.8 * np.sqrt(env.s_max**2 - state.carry.row[:6] ** 2), rtol=1e-6)
 
 
+@pytest.mark.full
 def test_noise_only_adds_and_has_the_columns_size() -> None:
     quiet, noisy = folder_env(), folder_env(noise=True)
     keys = jax.random.split(jax.random.key(0), 2000)
@@ -244,6 +247,7 @@ def test_costs() -> None:
     assert spec.num_costs == 4 and state.cost.shape == (6, 4)
 
 
+@pytest.mark.full
 def test_reward_options_and_blocks() -> None:
     state = first(folder_env())
     step = jnp.full((6, 1), 0.4)
