@@ -71,6 +71,8 @@ def test_words_of_a_command_line_become_typed():
     [
         ({"num_env": 3}, "unknown setting 'num_env'; did you mean 'num_envs'?"),
         ({"method": "mapo"}, "unknown method 'mapo'; did you mean 'mappo'?"),
+        ({"method": 3}, "method = 3 does not fit: expected a word, as one of mappo, happo"),
+        ({"method": ["mappo"]}, "method = ['mappo'] does not fit"),
         ({"steps": "many"}, "steps = 'many' does not fit: expected a whole number"),
         ({"steps": 1.5e4 + 0.5}, "expected a whole number"),
         ({"steps": -1}, "steps must be at least 1, not -1"),
@@ -104,6 +106,8 @@ def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):
         ("task = ", "is not valid TOML"),
         ('task = "lane"\nmethods = 3', "unknown setting 'methods'; did you mean 'method'?"),
         ("[method.happpo]\nclip = 1", "unknown method 'happpo'; did you mean 'happo'?"),
+        ('task = "lane"\n[method.f4sg]\nclpi = 1', "unknown setting 'clpi'; did you mean 'clip'?"),
+        ('task = "lane"\n[method.happo]\nclip = "wide"', "clip = 'wide' does not fit: expected a number"),
         ("method = 3", "'method' must be a name, or [method.NAME] tables"),
     ],
 )

@@ -32,6 +32,13 @@ def test_a_file_extends_a_name_and_a_path(tmp_path: pathlib.Path):
     assert load_config(top, method="mappo").epochs == 6
 
 
+def test_a_file_called_like_a_task_is_not_the_task(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("lane").write_text('extends = "switch"\nclip = 0.4')  # and the package's switch extends its own lane
+    assert (load_config("./lane").task, load_config("./lane").clip) == ("switch", 0.4)
+    assert load_config("lane").task == "lane"
+
+
 @pytest.mark.parametrize(
     ("base", "says"),
     [
