@@ -154,9 +154,9 @@ def read_preset(name: str) -> Table:
       UsageError: there is none of that name.
     """
     tables = _presets()
-    if name not in tables:
-        raise UsageError(f"unknown preset '{name}'{did_you_mean(name, tables)}")
-    return {key: value for key, value in tables[name].items() if key != "about"}
+    if str(name) not in tables:
+        raise UsageError(f"unknown preset '{name}'{did_you_mean(str(name), tables)}")
+    return {key: value for key, value in tables[str(name)].items() if key != "about"}
 
 
 def resume_command(out: str) -> str:
@@ -270,8 +270,8 @@ def to_type(kind: Any, value: Any) -> Any:
         return tuple(to_type(int, part) for part in parts)
     if float in parameters:  # a number, or one for each cost
         parts = value.split(",") if isinstance(value, str) else value
-        several = isinstance(parts, list | tuple) and len(parts) > 1
-        return tuple(to_type(float, part) for part in parts) if several else to_type(float, value)
+        each = [to_type(float, part) for part in (parts if isinstance(parts, list | tuple) else [parts])]
+        return tuple(each) if len(each) > 1 else each[0] if each else _fail()
     return _options(value)
 
 

@@ -66,11 +66,22 @@ def test_words_of_a_command_line_become_typed():
     assert config.env == (("num_agents", 1),)
 
 
+@pytest.mark.parametrize("value", [2, 2.0, "2", [2], (2.0,), ["2"]])
+def test_a_list_of_one_limit_is_that_limit(value: object):
+    assert load_config("lane", cost_limit=value).cost_limit == 2.0
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
         ({"num_env": 3}, "unknown setting 'num_env'; did you mean 'num_envs'?"),
         ({"method": "mapo"}, "unknown method 'mapo'; did you mean 'mappo'?"),
+        ({"preset": "smok"}, "unknown preset 'smok'; did you mean 'smoke'?"),
+        ({"preset": 3}, "unknown preset '3'; known: default, smoke"),
+        ({"preset": None}, "unknown preset 'None'"),
+        ({"preset": ["smoke"]}, "unknown preset '['smoke']'"),
+        ({"cost_limit": []}, "cost_limit = [] does not fit: expected a number, or one for each cost"),
+        ({"cost_limit": [[1]]}, "cost_limit = [[1]] does not fit"),
         ({"method": 3}, "method = 3 does not fit: expected a word, as one of mappo, happo"),
         ({"method": ["mappo"]}, "method = ['mappo'] does not fit"),
         ({"steps": "many"}, "steps = 'many' does not fit: expected a whole number"),
@@ -93,9 +104,8 @@ def test_words_of_a_command_line_become_typed():
     ],
 )
 def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):
-    method = changes.pop("method", None)
     with pytest.raises(UsageError) as error:
-        load_config("lane", method=method, **changes)
+        load_config("lane", **changes)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
