@@ -42,7 +42,8 @@ Train lane | unknown command 'Train'; did you mean 'train'?
 --verbose train lane | unknown argument '--verbose'
 train lane lane | unexpected word 'lane' (see pmt train --help)
 train 'lane ' | unknown task 'lane '; did you mean 'lane'?
-train LANE | unknown task 'LANE'
+train LANE | unknown task 'LANE'; did you mean 'lane'?
+train lane --method MAPPO_L | unknown method 'MAPPO_L'; did you mean 'mappo_l'?
 train '' | unknown task ''
 train . | unknown task '.'
 train lane:Lane | unknown task 'lane:Lane'; did you mean 'lane'?
