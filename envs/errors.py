@@ -18,10 +18,11 @@ class TaskError(ValueError):
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """The nearest of `choices` as '; did you mean ...?', or the whole list if none is near."""
+    """The nearest of `choices`, whatever its case, as '; did you mean ...?', or the whole list if none is near."""
     choices = list(choices)
-    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(choices) or 'none'}"
+    folded = {choice.casefold(): choice for choice in choices}
+    near = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.5)
+    return f"; did you mean '{folded[near[0]]}'?" if near else f"; known: {', '.join(choices) or 'none'}"
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

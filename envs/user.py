@@ -134,8 +134,9 @@ def check_shapes(env: Env, name: str) -> None:
 
     from .base import EnvSpec
 
-    if not isinstance(env.spec, EnvSpec):
-        raise TaskError(f"{name}: spec must be an EnvSpec of envs/base.py, not a {type(env.spec).__name__}")
+    spec = getattr(env, "spec", None)
+    if not isinstance(spec, EnvSpec):
+        raise TaskError(f"{name}: spec must be an EnvSpec of envs/base.py, not a {type(spec).__name__}")
     start = _guard(f"{name}: reset fails", lambda: jax.eval_shape(env.reset, jax.random.key(0)))
     _check_fields(env.spec, start, name)
     action = jnp.zeros(env.spec.action_mask.shape)

@@ -23,6 +23,8 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
       UsageError: the folder cannot be written.
     """
+    if not out.name:  # "", "." and "/", next to which no file can lie
+        raise UsageError(f"cannot write {out}: it is a folder; choose another -o")
     partial = out.with_stem(f".{out.stem}.partial")
     try:
         if out.exists() and not out.is_file() and not out.is_dir():
@@ -45,6 +47,8 @@ def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
       UsageError: the folder cannot be written.
     """
+    if not out.absolute().name:
+        raise UsageError(f"cannot write into {out}: it is the root of all folders; choose another folder")
     partial = out.absolute().with_name(f".{out.absolute().name}.partial-{os.getpid()}")
     try:
         partial.mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 import json
@@ -163,8 +164,16 @@ def as_paper(file: pathlib.Path) -> str:
 
 
 def as_summary(files: pathlib.Path) -> str:
-    """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files."""
-    cells = {(task, row.method): (row, text) for (task, _), (row, text) in _summaries(files).items()}
+    """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files.
+
+    A method has its label where it has several settings in a task.
+    """
+    found = _summaries(files)
+    often = collections.Counter((task, row.method) for (task, _), (row, _) in found.items())
+    cells = {
+        (task, row.method if often[task, row.method] == 1 else label): (row, text)
+        for (task, label), (row, text) in found.items()
+    }
     tasks, methods = (list(dict.fromkeys(name)) for name in zip(*cells, strict=True))
     limits = {row.task: row.limits for row, _ in cells.values()}
     head = ["", *(f"`{task}` (limit {limits[task]})" for task in tasks)]

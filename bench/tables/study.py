@@ -72,9 +72,10 @@ def as_probe(files: pathlib.Path) -> str:
 PAIR = ("mappo_l", "f4sg")
 
 
-def _cell(run: runs.Run) -> tuple[float, float]:
-    """What F4SG and MAPPO-L have in common if they are compared."""
-    return share(run), -_limit(run)
+def _cell(run: runs.Run) -> tuple[float, float, str]:
+    """What F4SG and MAPPO-L have in common if they are compared: p, limit and all settings but the sample's."""
+    own = {name: x for name, x in settings(run).items() if name not in runs.OF_A_SAMPLE | {"method"}}
+    return share(run), -_limit(run), repr(sorted(own.items(), key=str))
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:

@@ -36,10 +36,13 @@ def run(argv: Sequence[str] | None = None) -> NoReturn:
     A thread of C++ that frees an array of Python's while the interpreter ends aborts the process, with the run saved
     and another exit code. What is registered to run at the end runs before.
     """
-    code = main(argv)
-    for thread in threading.enumerate():
-        if thread is not threading.current_thread() and not thread.daemon:
-            thread.join()
+    end(main(argv))
+
+
+def end(code: int) -> NoReturn:
+    """The end of the process, without that of the interpreter, as `run` says."""
+    # As Python does: the threads of pools wait until this tells them to end.
+    threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed, or nobody reads it any more

@@ -12,6 +12,7 @@ from ..output import say
 from ..studies import sweep
 from ..training import processes
 from ..trust import trusting
+from . import end
 from .process import answer
 
 
@@ -36,4 +37,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

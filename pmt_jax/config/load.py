@@ -86,8 +86,10 @@ def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) 
         return shared
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
         raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
-    for name in tables:
+    for name, own in tables.items():  # those of other methods, too, or a typing error shows in one run of many
         methods.known(name)
+        for field, value in own.items():
+            convert(field, value)
     return shared | tables.get(method, {})
 
 
@@ -152,9 +154,9 @@ def read_preset(name: str) -> Table:
       UsageError: there is none of that name.
     """
     tables = _presets()
-    if name not in tables:
-        raise UsageError(f"unknown preset '{name}'{did_you_mean(name, tables)}")
-    return {key: value for key, value in tables[name].items() if key != "about"}
+    if str(name) not in tables:
+        raise UsageError(f"unknown preset '{name}'{did_you_mean(str(name), tables)}")
+    return {key: value for key, value in tables[str(name)].items() if key != "about"}
 
 
 def resume_command(out: str) -> str:
@@ -177,15 +179,31 @@ def _resolve(source: str, below: tuple[str, ...]) -> Table:
     base = table.pop("extends", None)
     if base is None:
         return table
-    if not isinstance(base, str):
-        raise UsageError(f"{source}: 'extends' must be one name that pmt envs lists or one path, not {base!r}")
-    found = base if base in known else os.path.join(os.path.dirname(source), base)
-    if found not in known and not os.path.isfile(found):
-        raise UsageError(f"{source} extends '{base}', which is not there{did_you_mean(base, names())}")
-    chain = (*below, os.path.realpath(source))
-    if os.path.realpath(found) in chain:
+    found = extended(source, base)
+    chain = (*below, _identity(source))
+    if _identity(found) in chain:
         raise UsageError(f"{source} extends '{base}', which extends it in turn")
     return over(_resolve(found, chain), table)
+
+
+def extended(source: str | pathlib.Path, base: Any) -> str:
+    """What the file `source` means by `extends = base`: a name in `names()`, or the path of a file next to it.
+
+    Raises:
+      UsageError: it is neither.
+    """
+    if not isinstance(base, str):
+        raise UsageError(f"{source}: 'extends' must be one name that pmt envs lists or one path, not {base!r}")
+    known = _packaged()
+    found = base if base in known else os.path.join(os.path.dirname(source), base)
+    if found not in known and not os.path.isfile(found):
+        raise UsageError(f"{source} extends '{base}', which is not there{did_you_mean(base, known)}")
+    return found
+
+
+def _identity(source: str) -> str:
+    """The same for each way to write a path; a name of the package is no path, even next to a file called so."""
+    return source if source in _packaged() else os.path.realpath(source)
 
 
 def over(base: Table, top: Table) -> Table:
@@ -252,8 +270,8 @@ def to_type(kind: Any, value: Any) -> Any:
         return tuple(to_type(int, part) for part in parts)
     if float in parameters:  # a number, or one for each cost
         parts = value.split(",") if isinstance(value, str) else value
-        several = isinstance(parts, list | tuple) and len(parts) > 1
-        return tuple(to_type(float, part) for part in parts) if several else to_type(float, value)
+        each = [to_type(float, part) for part in (parts if isinstance(parts, list | tuple) else [parts])]
+        return tuple(each) if len(each) > 1 else each[0] if each else _fail()
     return _options(value)
 
 

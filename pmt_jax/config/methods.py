@@ -99,6 +99,8 @@ def known(name: str) -> str:
     Raises:
       UsageError: it is neither a row of the table nor a Python file.
     """
+    if not isinstance(name, str):
+        raise UsageError(f"method = {name!r} does not fit: expected a word, as one of {', '.join(METHODS)}")
     if is_file(name):
         return absolute(name)
     if name not in METHODS:

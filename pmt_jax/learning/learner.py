@@ -46,9 +46,9 @@ def make_train(config: Config, env: tasks.Env | None = None) -> Train:
       >>> metrics["violation_rate"].shape
       (2, 1)
     """
+    setup = make_setup(config, env)
     if config.init:
         raise UsageError("make_train starts anew; init is for pmt train, which reads run folders")
-    setup = make_setup(config, env)
 
     def train(key: jax.Array, hyper: Hyper = setup.hyper) -> tuple[LearnerState, Metrics]:
         return train_chunk(setup, hyper, init(setup, hyper, key), config.num_updates)

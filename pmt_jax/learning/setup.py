@@ -112,11 +112,15 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
       env: an environment of your own, in place of `config.task`.
 
     Raises:
-      UsageError: unknown task or task option, an engine that cannot run here, an `env` that breaks the contract, or a
-        setting of JAX that no program runs with.
+      UsageError: a `config` that is no Config, unknown task or task option, an engine that cannot run here, an `env`
+        that breaks the contract, or a setting of JAX that no program runs with.
     """
     if found := numerics.obstacle():
         raise UsageError(found)
+    if not isinstance(config, Config):
+        raise UsageError(f"settings must be a Config, as load_config('lane') returns, not {config!r}")
+    if isinstance(env, str):
+        raise UsageError(f"env must be an environment, as envs.make('{env}') returns, not the name '{env}'")
     method = find(config.method)
     if env is not None:
         tasks.check(env)

@@ -99,7 +99,7 @@ def load_seed(
     setup, states = load_run(pathlib.Path(folder), which, physics)
     first, count = setup.config.seed, setup.config.seeds
     chosen = first if seed is None else seed
-    if not first <= chosen < first + count:
+    if chosen not in range(first, first + count):
         raise UsageError(f"{folder} has no seed {seed}; it has {', '.join(map(str, range(first, first + count)))}")
     return setup, chosen, jax.tree.map(lambda x: x[chosen - first], states)
 

@@ -236,7 +236,7 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
 
 
 def _part(file: str | pathlib.Path, shared: dict[str, Any], table: dict[str, Any]) -> Part:
-    base = load.read(table.pop("extends")) if "extends" in table else {}
+    base = load.read(load.extended(file, table.pop("extends"))) if "extends" in table else {}
     if base and "task" in shared:
         raise UsageError(f"{file}: a [[sweep]] extends another file only where the file above it names no task")
     merged = load.over(load.over(base, shared), {k: v for k, v in table.items() if k not in PART})

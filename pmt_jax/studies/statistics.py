@@ -155,9 +155,11 @@ def u_test(ours: ArrayLike, theirs: ArrayLike) -> float:
 
 def welch_test(ours: ArrayLike, theirs: ArrayLike) -> float:
     """The two-sided p of Welch's t test, of means of unequal variances; scores [seeds] that all agree have p 0 or 1."""
-    if not np.ptp(ours) and not np.ptp(theirs):
-        return float(np.mean(ours) == np.mean(theirs))
-    return float(scipy.stats.ttest_ind(ours, theirs, equal_var=False).pvalue)
+    a, b = np.asarray(ours, float), np.asarray(theirs, float)
+    if not np.ptp(a) and not np.ptp(b):
+        return float(a.mean() == b.mean())
+    result: Any = scipy.stats.ttest_ind(a, b, equal_var=False)
+    return float(result.pvalue)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -10,7 +10,7 @@ import numpy as np
 from ..config.methods import METHODS
 from .run_log import RunLog, read
 
-NEAR = 2.0  # times the limit: costs that were never so low never came near it
+NEAR = 2.0  # times the limit: costs beyond that are not near it
 FALLING = 0.05  # share by which costs fell between the last two tenths of the steps, if they still fall
 AT_BOUND = 0.98  # share of lambda_max
 
@@ -65,11 +65,16 @@ def _advice(log: RunLog, beyond: Sequence[int]) -> str:
         return (
             f"{whose}: costs were still falling ({np.nanmean(before):.3g} to {np.nanmean(last):.3g}); train on: {more}"
         )
-    lowest = np.nanmin(cost, initial=np.inf)
-    if lowest > NEAR * limit:
-        stronger = "--lambda-lr" if constraint == "lagrangian" else "--limit-lr"
-        return f"{whose}: costs never came near the limit (lowest row {lowest:.3g}); raise {stronger}, or train longer"
+    if (last > NEAR * limit).any():
+        return _far(cost[last > NEAR * limit], whose, limit, constraint)
     return f"{whose}: costs stay about the limit; a higher --cost-margin holds them below it"
+
+
+def _far(cost: np.ndarray, whose: str, limit: float, constraint: str) -> str:
+    """What to do with seeds whose costs [S, rows] end far beyond the limit."""
+    lowest, stronger = np.nanmin(cost), "--lambda-lr" if constraint == "lagrangian" else "--limit-lr"
+    near = "never came" if lowest > NEAR * limit else "came, but did not stay,"
+    return f"{whose}: costs {near} near the limit (lowest row {lowest:.3g}); raise {stronger}, or train longer"
 
 
 def _constraint(log: RunLog) -> str:

@@ -8,14 +8,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..config.settings import HYPER_FIELDS
+from ..learning.constraint import in_unit
 from ..learning.setup import Setup
 from .metrics import LOSSES, Row
 
 MOST = 0.5  # share of a row's steps that may be quarantined
 MAX_RETURN = 1e8  # of a critic, in units of the reward (cost) of a step
+MAX_UNIT = 1e12  # of costs, beyond which squares of returns overflow
 FAULTS = {  # columns that count steps, and what these did
     "non_finite": "were not finite: reward 0, cost 1, end of the episode",
     "cost_out_of_range": "had a cost outside [0, 1]",
@@ -69,7 +72,7 @@ def diagnose(setup: Setup, index: int, row: Row, finite: bool, steps: int) -> st
     if lost or not finite:
         what = f"{lost[0]} {where} is {row[lost[0]]}" if lost else f"a weight {where} is not finite"
         return f"{what}; {_cause(setup, index, share)}"
-    return _divergence(row, where)
+    return _divergence(setup, index, row, where)
 
 
 def diagnose_evaluation(setup: Setup, row: Row) -> str | None:
@@ -117,12 +120,12 @@ def faults(counts: Mapping[str, int], steps: int) -> str:
 
 
 def _cause(setup: Setup, index: int, share: float) -> str:
-    """The likeliest reason for a loss that is not finite."""
-    if share:
-        return f"{share:.1%} of the environment steps were not finite: check the task's observations, rewards and costs"
+    """The likeliest reason for a loss that is not finite; steps with actions that are not finite are not either."""
     extreme = ", ".join(f"{name} = {value:g}" for name, value in _extreme_settings(setup, index).items())
     if extreme:
         return f"single precision cannot train with {extreme}"
+    if share:
+        return f"{share:.1%} of the environment steps were not finite: check the task's observations, rewards and costs"
     return "training diverged: try smaller learning rates (actor_lr, critic_lr, emotion_lr)"
 
 
@@ -132,16 +135,28 @@ def _extreme_settings(setup: Setup, index: int) -> dict[str, float]:
     values = {name: np.asarray(getattr(hyper, name)) for name in HYPER_FIELDS if name != "cost_limit"}
     own = {name: float(x[index] if x.ndim else x) for name, x in values.items()}
     usual = {name: 1.0 if name.endswith("_lr") and name != "lambda_lr" else 1e6 for name in own}
-    return {name: x for name, x in own.items() if usual[name] < x < math.inf}
+    found = {name: x for name, x in own.items() if usual[name] < x < math.inf}
+    tiny = {"cost_limit": min(setup.limits_of_seeds[index].each)} if _cost_unit(setup, index) > MAX_UNIT else {}
+    return found | tiny
 
 
-def _divergence(row: Row, where: str) -> str | None:
-    for critic, unit in (("critic", "reward"), ("cost_critic", "cost")):  # costs in units of the limit
-        mean, std = row[f"{critic}/return_mean"], row[f"{critic}/return_std"]
-        scale = max(1.0, abs(row[f"step_{unit}"]))
-        if max(abs(mean), std) > MAX_RETURN * scale:
+def _divergence(setup: Setup, index: int, row: Row, where: str) -> str | None:
+    for critic, what in (("critic", "reward"), ("cost_critic", "cost")):
+        mean, std, step = (row[name] for name in (f"{critic}/return_mean", f"{critic}/return_std", f"step_{what}"))
+        largest = max(abs(mean), std)
+        if largest <= MAX_RETURN * max(1.0, abs(step)):
+            continue
+        unit = _cost_unit(setup, index) if what == "cost" else 1.0
+        if largest > MAX_RETURN * max(1.0, abs(step)) * max(1.0, unit):
             return (
                 f"the {critic} {where} diverged: its returns are {mean:.2g} +- {std:.2g}, where a step's "
-                f"{unit} is {row[f'step_{unit}']:.2g}; try a smaller critic_lr, gamma or gae_lambda"
+                f"{what} is {step * unit:.2g}; try a smaller critic_lr, gamma or gae_lambda"
             )
     return None
+
+
+def _cost_unit(setup: Setup, index: int) -> float:
+    """What a cost of 1 is to the seed's cost critic, which counts in units of the limit; of several costs the most."""
+    hyper = setup.vmap_arguments[0]
+    own = jax.tree.map(lambda x: x[index], hyper) if jnp.ndim(hyper.clip) else hyper
+    return float(jnp.max(in_unit(setup, own, jnp.ones(()))))

@@ -692,12 +692,13 @@ def test_a_probe_compares_fear_at_the_same_limit_and_corrects_over_all_measures(
     often = [run_of_three_seeds("f4sg", 0.5, low), run_of_three_seeds("macpo", 0.5, high)]
     (tmp_path / "x.json").write_text(json.dumps([*often, run_of_three_seeds("mappo_l", 0.5, high)]))
     always = [run_of_three_seeds(method, 1.0, low) for method in ("mappo_l", "f4sg")]
-    alone = run_of_three_seeds("f4sg", 0.1, low)
-    (tmp_path / "y.json").write_text(json.dumps([*always, alone]))
+    alone = [run_of_three_seeds("f4sg", 0.1, low), run_of_three_seeds("mappo_l", 0.1, low, lambda_init=3.0)]
+    (tmp_path / "y.json").write_text(json.dumps([*always, *alone]))
     table = study.as_probe(tmp_path / "x+y.json")
     rows = [[x.strip() for x in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
     assert [row[:3] for row in rows] == [
         ["0.1", "5", "F4SG"],
+        ["0.1", "5", "MAPPO-L"],
         ["0.5", "5", "MAPPO-L"],
         ["0.5", "5", "F4SG"],
         ["1", "5", "MAPPO-L"],
@@ -705,6 +706,6 @@ def test_a_probe_compares_fear_at_the_same_limit_and_corrects_over_all_measures(
     ]
     single = study.welch_test(low, high)
     assert study.holm([single, single, 1.0, 1.0, 1.0, 1.0])[0] < 0.001  # two pairs, three measures each
-    assert [row[-1] for row in rows] == ["-", "-", "< .001, < .001, 1", "-", "1, 1, 1"]
-    assert [row[-3] for row in rows] == ["0 of 12", "12 of 12", "0 of 12", "0 of 12", "0 of 12"]
-    assert rows[2][-2].startswith("-70.0 [") and rows[4][-2].startswith("0.0 [") and rows[0][-2] == "-"
+    assert [row[-1] for row in rows] == ["-", "-", "-", "< .001, < .001, 1", "-", "1, 1, 1"]
+    assert [row[-3] for row in rows] == ["0 of 12", "0 of 12", "12 of 12", "0 of 12", "0 of 12", "0 of 12"]
+    assert rows[3][-2].startswith("-70.0 [") and rows[5][-2].startswith("0.0 [") and rows[0][-2] == "-"

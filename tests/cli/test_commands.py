@@ -67,14 +67,18 @@ run(sys.argv[1:])
 def test_a_process_ends_with_its_code_and_what_is_registered_and_no_thread_is_cut_off():
     """Also where a thread that nobody joins would run on while the interpreter ends."""
     program = """
-import atexit, sys, threading, time
+import atexit, concurrent.futures, sys, threading, time
 from pmt_jax import cli
+pool = concurrent.futures.ThreadPoolExecutor()  # its thread waits for work until the process says that it ends
+pool.submit(int).result()
 atexit.register(print, "registered")
 threading.Thread(target=lambda: (time.sleep(0.2), print("joined"))).start()
 threading.Thread(target=lambda: time.sleep(1000), daemon=True).start()
 cli.run(["version?"])
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment())
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment(), timeout=100
+    )
     assert result.returncode == 2 and result.stdout.split() == ["joined", "registered"]
 
 

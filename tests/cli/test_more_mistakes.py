@@ -42,7 +42,8 @@ Train lane | unknown command 'Train'; did you mean 'train'?
 --verbose train lane | unknown argument '--verbose'
 train lane lane | unexpected word 'lane' (see pmt train --help)
 train 'lane ' | unknown task 'lane '; did you mean 'lane'?
-train LANE | unknown task 'LANE'
+train LANE | unknown task 'LANE'; did you mean 'lane'?
+train lane --method MAPPO_L | unknown method 'MAPPO_L'; did you mean 'mappo_l'?
 train '' | unknown task ''
 train . | unknown task '.'
 train lane:Lane | unknown task 'lane:Lane'; did you mean 'lane'?
@@ -174,6 +175,11 @@ report broken | broken/metrics.jsonl: a row has step = "x", where a whole number
 table run --baseline nobody | no row is called 'nobody'
 table run --test | --test compares with a baseline
 table run -o notrun | cannot write notrun: Is a directory
+table run -o '' | cannot write .: it is a folder; choose another -o
+table run -o . | cannot write .: it is a folder
+table run -o ./ | cannot write .: it is a folder
+table run -o / | cannot write /: it is a folder
+export hub:ant_2x4/r4sg -o / | cannot write into /: it is the root of all folders
 table run --format pdf | unknown format 'pdf'
 reproduce table4 | unknown table 'table4'; did you mean 'table3'?
 reproduce table1 --budget huge | unknown budget 'huge'

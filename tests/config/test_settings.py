@@ -68,11 +68,24 @@ def test_words_of_a_command_line_become_typed():
     assert config.env == (("num_agents", 1),)
 
 
+@pytest.mark.parametrize("value", [2, 2.0, "2", [2], (2.0,), ["2"]])
+def test_a_list_of_one_limit_is_that_limit(value: object):
+    assert load_config("lane", cost_limit=value).cost_limit == 2.0
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
         ({"num_env": 3}, "unknown setting 'num_env'; did you mean 'num_envs'?"),
         ({"method": "mapo"}, "unknown method 'mapo'; did you mean 'mappo'?"),
+        ({"preset": "smok"}, "unknown preset 'smok'; did you mean 'smoke'?"),
+        ({"preset": 3}, "unknown preset '3'; known: default, smoke"),
+        ({"preset": None}, "unknown preset 'None'"),
+        ({"preset": ["smoke"]}, "unknown preset '['smoke']'"),
+        ({"cost_limit": []}, "cost_limit = [] does not fit: expected a number, or one for each cost"),
+        ({"cost_limit": [[1]]}, "cost_limit = [[1]] does not fit"),
+        ({"method": 3}, "method = 3 does not fit: expected a word, as one of mappo, happo"),
+        ({"method": ["mappo"]}, "method = ['mappo'] does not fit"),
         ({"steps": "many"}, "steps = 'many' does not fit: expected a whole number"),
         ({"steps": 1.5e4 + 0.5}, "expected a whole number"),
         ({"steps": -1}, "steps must be at least 1, not -1"),
@@ -93,9 +106,8 @@ def test_words_of_a_command_line_become_typed():
     ],
 )
 def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):
-    method = changes.pop("method", None)
     with pytest.raises(UsageError) as error:
-        load_config("lane", method=method, **changes)
+        load_config("lane", **changes)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -106,6 +118,8 @@ def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):
         ("task = ", "is not valid TOML"),
         ('task = "lane"\nmethods = 3', "unknown setting 'methods'; did you mean 'method'?"),
         ("[method.happpo]\nclip = 1", "unknown method 'happpo'; did you mean 'happo'?"),
+        ('task = "lane"\n[method.f4sg]\nclpi = 1', "unknown setting 'clpi'; did you mean 'clip'?"),
+        ('task = "lane"\n[method.happo]\nclip = "wide"', "clip = 'wide' does not fit: expected a number"),
         ("method = 3", "'method' must be a name, or [method.NAME] tables"),
     ],
 )
@@ -155,6 +169,13 @@ def test_a_file_extends_a_name_and_a_path(tmp_path: pathlib.Path):
     assert (config.task, config.clip, config.epochs, config.actor_lr) == ("lane", 0.4, 7, 0.5)
     assert (config.env, config.lambda_lr) == ((("num_agents", 3),), load_config("lane").lambda_lr)
     assert load_config(top, method="mappo").epochs == 6
+
+
+def test_a_file_called_like_a_task_is_not_the_task(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("lane").write_text('extends = "switch"\nclip = 0.4')  # and the package's switch extends its own lane
+    assert (load_config("./lane").task, load_config("./lane").clip) == ("switch", 0.4)
+    assert load_config("lane").task == "lane"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import envs
 from envs.toys import Lane
 from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.config.settings import Hyper
+from pmt_jax.errors import UsageError
 from pmt_jax.learning import constraint, critics, learner, rollout, schedules
 from pmt_jax.learning.maths import running_moments
 from pmt_jax.learning.setup import Setup
@@ -41,6 +42,22 @@ class TwoDangers(Lane):
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("lane",), "settings must be a Config, as load_config('lane') returns, not 'lane'"),
+        (({"task": "lane"},), "settings must be a Config"),
+        ((load_config("lane"), "switch"), "env must be an environment, as envs.make('switch') returns"),
+        ((load_config("lane"), 3), "int: spec must be an EnvSpec of envs/base.py, not a NoneType"),
+        ((load_config("lane", init="runs/x"),), "make_train starts anew"),
+    ],
+)
+def test_what_is_no_setting_or_environment_gets_a_sentence(arguments: tuple, says: str):
+    with pytest.raises(UsageError) as error:
+        make_train(*arguments)
+    assert says in str(error.value)
+
+
 def test_a_trial_does_not_depend_on_the_others_of_its_program():
     """Three seeds with a multiplier's learning rate each."""
     config = load_config("lane", method="mappo_l", **{**SMALL, "steps": 400})

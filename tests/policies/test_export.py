@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pmt_jax import load_config, load_policy, make_setup
+from pmt_jax.errors import UsageError
 from pmt_jax.learning.maths import running_moments
 from pmt_jax.policies import load, numpy_policy, onnx_policy
 from pmt_jax.policies.export import weights
@@ -30,8 +31,9 @@ def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
     np.testing.assert_allclose(jax.jit(jax.vmap(policy))(obs), expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(policy(obs[2]), expected[2], rtol=1e-5, atol=1e-6)
     assert np.abs(np.asarray(load_policy(whole, seed=0)(obs[2]) - expected[2])).max() > 1e-3
-    with pytest.raises(ValueError, match="has no seed 7; it has 0, 1"):
-        load_policy(whole, seed=7)
+    for seed in (7, -1, 0.5, "last"):
+        with pytest.raises(UsageError, match=f"has no seed {seed}; it has 0, 1"):
+            load_policy(whole, seed=seed)  # pyright: ignore[reportArgumentType]
 
 
 def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):

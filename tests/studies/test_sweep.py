@@ -347,6 +347,16 @@ def test_a_file_lists_parts(tmp_path: pathlib.Path, monkeypatch, cli):
     assert seen[lanes[0]].activation == "tanh"  # as lane in configs/tasks.toml says
 
 
+@pytest.mark.parametrize("file", ["base.toml", "deeper/base.toml"])
+def test_a_part_extends_a_file_next_to_its_own(file: str, tmp_path: pathlib.Path):
+    """From whichever folder the sweep starts."""
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text('extends = "paper/ant_2x4"\nclip = 0.3')
+    (tmp_path / "study.toml").write_text(f'[sweep]\nextends = "{file}"\nset.seed = [0, 100]')
+    found = points.make_points(points.from_file(tmp_path / "study.toml"))
+    assert {(config.task, config.clip, config.seeds) for config in found.values()} == {("ant_2x4", 0.3, 20)}
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -360,6 +370,10 @@ def test_a_file_lists_parts(tmp_path: pathlib.Path, monkeypatch, cli):
             "extends another file only where the file above it names no task",
         ),
         ('[[sweep]]\nextends = "lane"\nclip = 0.1\n[[sweep]]\nextends = "lane"', "two points have the name 'point'"),
+        ('[sweep]\nextends = "lane"\nmethod = 3', "method = 3 does not fit: expected a word"),
+        ('[sweep]\nextends = "lane"\nset.method = [["f4sg"]]', "method = ['f4sg'] does not fit: expected a word"),
+        ("[sweep]\nextends = 3", "'extends' must be one name that pmt envs lists or one path, not 3"),
+        ('[sweep]\nextends = "lan"', "extends 'lan', which is not there; did you mean 'lane'?"),
         ('[sweep]\nextends = "lane"\nset.clip = "0.1:0.2"', "clip has a range: add --random N"),
     ],
 )

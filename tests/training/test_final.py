@@ -128,6 +128,12 @@ CASES = {
     "at its bound": (log_of([FLAT, FLAT - 1], multiplier=20.0), "kept by 1 of 2 seeds", "raise --lambda-max"),
     "still falling": (log_of([np.linspace(5, 1.2, 20)]), "0 of 1 seed in", "costs were still falling"),
     "never near": (log_of([FLAT + 4]), "0 of 1", "costs never came near the limit (lowest row 5.3); raise --lambda-lr"),
+    "left it again": (
+        log_of([np.repeat([0.3, 24], 10)]),
+        "0 of 1",
+        "came, but did not stay, near the limit (lowest row 0.3)",
+    ),
+    "one far, one near": (log_of([FLAT, FLAT + 4]), "0 of 2", "costs never came near the limit (lowest row 5.3)"),
     "about the limit": (log_of([FLAT]), "0 of 1", "--cost-margin"),
     "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
     "trust region": (log_of([FLAT + 4], method="macpo"), "0 of 1", "raise --limit-lr"),

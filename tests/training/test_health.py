@@ -131,7 +131,13 @@ def row(**changes: float) -> dict[str, Any]:
             "the critic of seed 3 at step 100 diverged: its returns are 5 +- 2e+08, where",
         ),
         ({"critic__return_std": 2e8, "step_reward": -1e7}, {}, None),
-        ({"cost_critic__return_mean": -2e8}, {}, "the cost_critic of seed 3 at step 100 diverged"),
+        ({"cost_critic__return_mean": -2e10}, {}, "the cost_critic of seed 3 at step 100 diverged"),
+        ({"cost_critic__return_mean": 2e8}, {}, None),  # a cost of 1 is 25 / 0.8 limits
+        ({"cost_critic__return_std": 2e12}, {"cost_limit": 1e-9}, None),
+        ({"cost_critic__return_std": 4e18}, {"cost_limit": 1e-9}, "diverged: its returns are 5 +- 4e+18, where a step"),
+        ({"actor__loss": math.nan}, {"cost_limit": 1e-20}, "single precision cannot train with cost_limit = 1e-20"),
+        ({"actor__loss": math.nan, "non_finite": 20}, {"cost_limit": 1e-37}, "cannot train with cost_limit = 1e-37"),
+        ({"actor__loss": math.nan}, {"cost_limit": 0.0}, "training diverged: try smaller learning rates"),
     ],
 )
 def test_the_cause_is_told_apart(changes: dict[str, float], settings: dict[str, float], says: str | None):
