@@ -41,9 +41,10 @@ def run(argv: Sequence[str] | None = None) -> NoReturn:
 
 def end(code: int) -> NoReturn:
     """The end of the process, without that of the interpreter, as `run` says."""
-    # As Python does: the threads of pools wait until this tells them to end.
-    threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
-    atexit._run_exitfuncs()
+    with contextlib.suppress(KeyboardInterrupt):
+        # As Python does: the threads of pools wait until this tells them to end.
+        threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
+        atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed, or nobody reads it any more
             stream.flush()
