@@ -69,12 +69,16 @@ def store(folders: Sequence[pathlib.Path], out: pathlib.Path, same_end: bool = F
     return len(found)
 
 
-def load(file: pathlib.Path) -> list[Run]:
-    """The runs of a JSON file.
+def load(files: pathlib.Path) -> list[Run]:
+    """The runs of a JSON file, or of several whose names a + joins.
 
     Raises:
-      UsageError: it is not there, or is not what `store` makes.
+      UsageError: one is not there, or is not what `store` makes.
     """
+    return [run for name in files.stem.split("+") for run in _load(files.with_stem(name))]
+
+
+def _load(file: pathlib.Path) -> list[Run]:
     try:
         found = json.loads(file.read_text())
         for run in found:
@@ -212,7 +216,7 @@ def as_larger(files: pathlib.Path) -> str:
 
     Seeds of the README's table count too. Runs of one sample have the same task, method, settings and steps.
     """
-    more = [run for name in files.stem.split("+") for run in load(files.with_stem(name))]
+    more = load(files)
     body = []
     for name in HEADLINES:
         for run in load(files.with_stem(name)):
@@ -232,12 +236,20 @@ def _settings(config: str) -> dict[str, Any]:
     return tomllib.loads(config)
 
 
-def _kind(run: Run) -> tuple[Any, ...]:
-    """What runs of one sample have in common; settings that are newer than a run have what was done before."""
+def settings(run: Run) -> dict[str, Any]:
+    """A run's settings and its task's options; settings that are newer than it have what was done before."""
     stored = _settings(run["config"])
-    every = {field.name: field.default for field in dataclasses.fields(Config)} | OLD | stored | stored.get("env", {})
-    same = {name: repr(value) for name, value in every.items() if name not in OF_A_SAMPLE | {"env"}}
-    return run["source"], max(run["steps"]), sorted(same.items())
+    return {field.name: field.default for field in dataclasses.fields(Config)} | OLD | stored | stored.get("env", {})
+
+
+def shared(run: Run) -> dict[str, str]:
+    """What runs of one sample have in common: their settings, written out."""
+    return {name: repr(x) for name, x in sorted(settings(run).items()) if name not in OF_A_SAMPLE | {"env"}}
+
+
+def _kind(run: Run) -> tuple[Any, ...]:
+    """What tells a run's sample from others."""
+    return run["source"], max(run["steps"]), shared(run)
 
 
 def as_ran(files: pathlib.Path) -> str:
@@ -310,13 +322,9 @@ def as_points(file: pathlib.Path) -> str:
 
 
 def as_mean_actions(file: pathlib.Path) -> str:
-    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions.
-
-    A + joins the names of several files.
-    """
-    stored = [run for name in file.stem.split("+") for run in load(file.with_stem(name))]
+    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions."""
     order = list(METHODS)
-    found = sorted(stored, key=lambda run: (run["task"], run["cost_limit"], order.index(run["method"])))
+    found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], order.index(run["method"])))
     several = len({run["task"] for run in found}) > 1
     body = []
     for run in found:

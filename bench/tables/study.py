@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import pathlib
-import tomllib
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +16,7 @@ from . import runs
 Scores = NDArray[np.float64]  # [seeds]
 
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
+PAIR = ("mappo_l", "f4sg")
 
 
 def measures(run: runs.Run) -> dict[str, Scores]:
@@ -27,19 +25,9 @@ def measures(run: runs.Run) -> dict[str, Scores]:
     return {name: np.array(run["table"][column], float) for name, column in columns.items()}
 
 
-def settings(run: runs.Run) -> dict[str, Any]:
-    """The run's settings; those that are newer than it have what was done before."""
-    return {"cost_seen": 1.0} | runs.OLD | _config(run["config"])
-
-
-@functools.cache  # a table asks for the settings of a run many times
-def _config(text: str) -> dict[str, Any]:
-    return tomllib.loads(text)
-
-
 def share(run: runs.Run) -> float:
     """The probability with which a costly step is noticed."""
-    return settings(run)["cost_seen"]
+    return runs.settings(run)["cost_seen"]
 
 
 def unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
@@ -48,12 +36,12 @@ def unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
 
 
 def as_probe(files: pathlib.Path) -> str:
-    """F4SG against MAPPO-L at the same probability and limit of true costs; a + joins the names of several files.
+    """F4SG against MAPPO-L with the same settings, probability and limit of true costs; a + joins the names of files.
 
     The tests are Welch's, corrected by Holm over the three measures of all pairs together. d is Cohen's.
     """
-    stored = [run for name in files.stem.split("+") for run in runs.load(files.with_stem(name))]
-    found = sorted((run for run in stored if run["method"] in PAIR), key=lambda run: (*_cell(run), _rank(run)))
+    compared = [run for run in runs.load(files) if run["method"] in PAIR]
+    found = sorted(compared, key=lambda run: (*_cell(run), _rank(run)))
     scores = [measures(run) for run in found]
     pairs = [j for j in range(1, len(found)) if _cell(found[j]) == _cell(found[j - 1])]  # F4SG's row, after its other
     order = ("training", "end", "reward")
@@ -62,20 +50,16 @@ def as_probe(files: pathlib.Path) -> str:
     body = []
     for j, (run, own) in enumerate(zip(found, scores, strict=True)):
         line = [f"{share(run):g}", f"{_limit(run):g}", NAMES[run["method"]], *(mean_sd(own[name]) for name in order)]
-        compared = (_effect(own["training"], scores[j - 1]["training"]), corrected[j]) if j in corrected else ("-", "-")
-        body.append([*line, unsafe(run, own), *compared])
+        effect = (_effect(own["training"], scores[j - 1]["training"]), corrected[j]) if j in corrected else ("-", "-")
+        body.append([*line, unsafe(run, own), *effect])
     head = ["p", "limit", "method", "harm: costly steps per 1,000, training", "true cost at the end", "reward"]
     head += ["seeds beyond the limit", "harm less MAPPO-L's [95 %], d", "corrected p: harm, cost, reward"]
     return markdown(head, body)
 
 
-PAIR = ("mappo_l", "f4sg")
-
-
-def _cell(run: runs.Run) -> tuple[float, float, str]:
+def _cell(run: runs.Run) -> tuple[float, float, list[tuple[str, str]]]:
     """What F4SG and MAPPO-L have in common if they are compared: p, limit and all settings but the sample's."""
-    own = {name: x for name, x in settings(run).items() if name not in runs.OF_A_SAMPLE | {"method"}}
-    return share(run), -_limit(run), repr(sorted(own.items(), key=str))
+    return share(run), -_limit(run), [(name, x) for name, x in runs.shared(run).items() if name != "method"]
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:

@@ -37,7 +37,7 @@ def number(mark: str) -> str:
     if len(given) < 3:
         raise UsageError(f"'{mark}' does not fit: expected {what}:FILE:METHOD:LIMIT")
     files, method, limit, *words = given
-    stored = [run for name in files.split("+") for run in runs.load(records.RESULTS / f"{name}.json")]
+    stored = runs.load(records.RESULTS / f"{files}.json")
     found = [run for run in stored if method == "*" or run["method"] in method.split("+")]
     found = [run for run in found if limit in ("*", f"{run['cost_limit']:g}")]
     found = [run for run in found if set(words) <= {run["task"], *run["label"].split()}]

@@ -9,7 +9,7 @@ import pathlib
 import shlex
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -325,23 +325,27 @@ def continues(folder: pathlib.Path, whole: pathlib.Path, by_file: bool) -> None:
 QUIETLY = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True, "database": None}
 
 
-@settings(max_examples=8, **QUIETLY)
-@given(harms, st.booleans())
-def test_a_run_continues_from_what_is_whole(whole: pathlib.Path, harmed: list, by_file: bool):
+@contextlib.contextmanager
+def copy_of(whole: pathlib.Path, harmed: list) -> Iterator[pathlib.Path]:
+    """The run's folder once more, with these harms."""
     with tempfile.TemporaryDirectory() as place:
         folder = pathlib.Path(shutil.copytree(whole, pathlib.Path(place, "run")))
         for where, left in harmed:
             harm(folder, where, left)
+        yield folder
+
+
+@settings(max_examples=8, **QUIETLY)
+@given(harms, st.booleans())
+def test_a_run_continues_from_what_is_whole(whole: pathlib.Path, harmed: list, by_file: bool):
+    with copy_of(whole, harmed) as folder:
         continues(folder, whole, by_file)
 
 
 @settings(max_examples=3, **QUIETLY)
 @given(harms)
 def test_commands_that_read_work_on_what_is_whole(whole: pathlib.Path, harmed: list):
-    with tempfile.TemporaryDirectory() as place:
-        folder = pathlib.Path(shutil.copytree(whole, pathlib.Path(place, "run")))
-        for where, left in harmed:
-            harm(folder, where, left)
+    with copy_of(whole, harmed) as folder:
         reads_only(folder, whole, report=False)
 
 
@@ -350,9 +354,6 @@ def test_commands_that_read_work_on_what_is_whole(whole: pathlib.Path, harmed: l
 @settings(max_examples=5, **(QUIETLY | {"derandomize": False}))
 @given(harms, st.booleans())
 def test_both_on_many_more(whole: pathlib.Path, harmed: list, by_file: bool):
-    with tempfile.TemporaryDirectory() as place:
-        folder = pathlib.Path(shutil.copytree(whole, pathlib.Path(place, "run")))
-        for where, left in harmed:
-            harm(folder, where, left)
+    with copy_of(whole, harmed) as folder:
         reads_only(folder, whole, report=True)
         continues(folder, whole, by_file)
