@@ -307,7 +307,8 @@ BENCHES = {
         on="either",
         gpu=(
             _training("ant_2x4", "mappo_l", 1, 2048, 8, physics="fused"),
-            _training("ant_2x4", "mappo_l", 20, 384, 32, physics="fused"),
+            *(_training("ant_2x4", "mappo_l", seeds, 384, 32, physics="fused") for seeds in (5, 20)),
+            _training("ant_2x4", "macpo", 20, 384, 32, physics="fused"),
             _training("ant_2x4", "mappo_l", 1, 2048, 8, physics="warp"),
         ),
     ),
