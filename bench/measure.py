@@ -43,7 +43,7 @@ class Effort(NamedTuple):
     patience: float
 
 
-# The host of a shared GPU machine is never quiet, and other work on its cores hardly reaches the GPU: no turn waits there.
+# The host of a shared GPU is never quiet, and other work on its cores hardly reaches the GPU: no turn waits there.
 FULL, ON_GPU, QUICK = Effort(5, 1.0, 60.0), Effort(5, 1.0, 0.0), Effort(2, 0.3, 0.0)
 Failures = dict[Case, str]
 

@@ -71,11 +71,10 @@ def _train(folder: pathlib.Path, case: Case) -> Record:
         said = log.read()
     if done[1] != 0 or (compiled := re.search(r"compiled in ([0-9.]+) s \(compile cache (\w+)\)", said)) is None:
         raise RuntimeError(f"{' '.join(command)} failed: {said.strip().splitlines()[-1]}")
-    usage, kernels = done[2], re.search(r"kernels ready after ([0-9.]+) s", said)
+    usage = done[2]
     return {
         "cache": compiled[2],
         "compile_seconds": float(compiled[1]),
-        **({"kernel_seconds": float(kernels[1])} if kernels else {}),
         "first_update_seconds": round(first or time.perf_counter() - begin, 2),
         "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
         "memory_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),

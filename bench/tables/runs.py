@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import functools
 import json
-import math
 import pathlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from pmt_jax.config.methods import METHODS
-from pmt_jax.config.settings import Config
 from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
 from pmt_jax.limits import Limits
@@ -34,22 +31,12 @@ TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_see
 # Stored as means over seeds.
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
 HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
-OLD = {"fear_start": -4.0, "fear_lr_start": 0.0}  # of runs without these settings: not the defaults of today
-OLD |= {"lambda_rule": "integral", "cost_advantage": "std", "fear_history": "rollout"}  # these are no settings any more
-OLD |= {"regret_mask": "top", "regret_target": "mode", "cost_false": 0.0}
-# Of runs before costs were counted in units of the limit (docs/design/earlier.md): what was the default then.
-OLD |= {"cost_value_clip": math.nan, "max_grad_norm": 10.0, "lambda_kp": 0.0, "limit_lr": 0.0, "lambda_unit": "step"}
-OLD |= {"cost_std_floor": 0.05, "cost_estimate": "episode", "episode_starts": "together", "lr_half_life": math.inf}
-OLD |= {"kl_half_life": math.inf, "std_half_life": math.inf, "std_decay_start": 0.0, "actor_lr_half_life": math.inf}
-OLD |= {"value_norm_decay": 0.995, "limit_windup": 1.0, "lambda_lr": 0.1, "surrogate_weight": 1.0, "lambda_kd": 0.0}
-OLD |= {"fear_l2": 1.0, "regret_l2": 1.0, "temperature": 0.5, "regret_max": 0.9, "regret_response": "letter"}
-OLD |= {"fear_loss": "ce", "cost_margin": 0.0, "lambda_init": 0.78}
-OLD |= {"first_step": 1.0, "step_decay": 0.8, "kl_slack": 1.5, "trust_steps": 1, "damping": 0.1, "init_fear": ""}
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
 TRUE = "true cost"  # also of steps that the learner did not observe
+TRUE_WORST = "true worst agent"  # of tasks whose agents have costs of their own
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 
@@ -211,45 +198,20 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
     return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
 
 
-def as_larger(files: pathlib.Path) -> str:
-    """The cells of the README's table for which `files`, whose names a + joins, have more seeds of the same settings.
-
-    Seeds of the README's table count too. Runs of one sample have the same task, method, settings and steps.
-    """
-    more = load(files)
-    body = []
-    for name in HEADLINES:
-        for run in load(files.with_stem(name)):
-            sample = [run, *(other for other in more if _kind(other) == _kind(run))]
-            if len(sample) == 1:
-                continue
-            cost, reward = (np.concatenate([_scores(x)[of] for x in sample]) for of in ("cost", "reward"))
-            line = [f"`{run['task']}`", f"`{run['method']}`", str(cost.size), f"{number(reward.mean(), ',.4g')}"]
-            line += [f"{number(x, '.3g')}" for x in (cost.mean(), np.median(cost), cost.max(), run["cost_limit"])]
-            body.append([*line, f"{(cost <= run['cost_limit']).sum()} of {cost.size}"])
-    head = ("task", "method", "seeds", "reward", "cost", "median", "worst seed", "limit", "seeds within")
-    return markdown(head, body)
-
-
 @functools.cache  # each run is compared with each
 def _settings(config: str) -> dict[str, Any]:
     return tomllib.loads(config)
 
 
 def settings(run: Run) -> dict[str, Any]:
-    """A run's settings and its task's options; settings that are newer than it have what was done before."""
+    """A run's settings and its task's options."""
     stored = _settings(run["config"])
-    return {field.name: field.default for field in dataclasses.fields(Config)} | OLD | stored | stored.get("env", {})
+    return stored | stored.get("env", {})
 
 
 def shared(run: Run) -> dict[str, str]:
     """What runs of one sample have in common: their settings, written out."""
     return {name: repr(x) for name, x in sorted(settings(run).items()) if name not in OF_A_SAMPLE | {"env"}}
-
-
-def _kind(run: Run) -> tuple[Any, ...]:
-    """What tells a run's sample from others."""
-    return run["source"], max(run["steps"]), shared(run)
 
 
 def as_ran(files: pathlib.Path) -> str:
@@ -322,7 +284,10 @@ def as_points(file: pathlib.Path) -> str:
 
 
 def as_mean_actions(file: pathlib.Path) -> str:
-    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions."""
+    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions.
+
+    Costs are the worst agent's where agents differ.
+    """
     order = list(METHODS)
     found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], order.index(run["method"])))
     several = len({run["task"] for run in found}) > 1
@@ -330,8 +295,9 @@ def as_mean_actions(file: pathlib.Path) -> str:
     for run in found:
         label = " ".join(word for word in run["label"].split() if not word.startswith("cost_limit="))
         line = [*([run["task"]] if several else []), f"{run['cost_limit']:g}", label]
-        for source in ("", OF_MEAN_ACTIONS):
-            cost, reward = (np.array(run["table"][source + name], float) for name in ("cost", "reward"))
+        row = row_of(run)
+        deployed = (row.scores[f"{OF_MEAN_ACTIONS}{name}"] for name in ("cost", "reward"))
+        for cost, reward in ((row.score("worst agent"), row.scores["reward"]), deployed):
             line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
         body.append(line)
     about, measured = ["task", "limit", "method"][not several :], ["seeds within", "cost", "reward"]
@@ -345,6 +311,5 @@ KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "paper": as_paper,
     "summary": as_summary,
     "overview": as_overview,
-    "larger": as_larger,
     "ran": as_ran,
 }

@@ -217,7 +217,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "efficiency": _shown("{:.2f}", _efficiency),
     "memory, GB": _shown("{:.1f}", "memory_gb"),
     "compile cache": _shown("{}", "cache"),
-    "kernels, s": _shown("{:.1f}", "kernel_seconds"),
     "first update, s": _shown("{:.1f}", "first_update_seconds"),
     "ours f32 is faster by (lowest)": _ours_cell,
     "CR": _shown("{:.3f}", "info/totally_controllable_ratio"),
@@ -406,7 +405,7 @@ def side_by_side(reports: Reports) -> str:
 
 
 SPEED = ("", "engine", "seeds x environments", "environment steps/s", "of plain loops at once")
-STARTS = ("what", "environments x steps", "compile cache", "kernels, s", "compile, s", "first update, s", "memory, GB")
+STARTS = ("what", "environments x steps", "compile cache", "compile, s", "first update, s", "memory, GB")
 EVERY = ("plain loop", "environment", "training")
 SIZES = "seeds x environments x steps"
 TABLES: dict[str, Callable[[Reports], str]] = {
@@ -456,6 +455,9 @@ TABLES: dict[str, Callable[[Reports], str]] = {
         "engines", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s", "compile, s")
     ),
     "robots": Table("robots", EVERY, ("task", *SPEED)),
+    "multi_goal": Table(
+        "multi_goal", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s")
+    ),
     "loop": Table("loop", ("training",), ("method", "engine", SIZES, "environment steps/s", "update, s", "x one seed")),
     "scaling": Table(
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")

@@ -21,7 +21,7 @@ PAIR = ("mappo_l", "f4sg")
 
 def measures(run: runs.Run) -> dict[str, Scores]:
     """The three measures of each seed: true cost at the end and per 1,000 steps of training, reward at the end."""
-    columns = {"end": runs.TRUE, "training": runs.TRUE_WHILE_TRAINING, "reward": "reward"}
+    columns = {"training": runs.TRUE_WHILE_TRAINING, "end": runs.TRUE, "reward": "reward"}
     return {name: np.array(run["table"][column], float) for name, column in columns.items()}
 
 
@@ -30,44 +30,76 @@ def share(run: runs.Run) -> float:
     return runs.settings(run)["cost_seen"]
 
 
-def unsafe(run: runs.Run, own: dict[str, Scores]) -> str:
-    """How many seeds end beyond the limit."""
-    return f"{(own['end'] > run['cost_limit'] / share(run)).sum()} of {len(own['end'])}"
+def unsafe(run: runs.Run) -> str:
+    """How many seeds end beyond the limit, with the worst agent's cost where agents differ."""
+    judged = np.array(run["table"].get(runs.TRUE_WORST, run["table"][runs.TRUE]), float)
+    return f"{(judged > run['cost_limit'] / share(run)).sum()} of {len(judged)}"
+
+
+def pairs(files: pathlib.Path) -> list[tuple[runs.Run, runs.Run]]:
+    """MAPPO-L and F4SG wherever all else is equal: task, probability, limit of true costs, and settings.
+
+    They come by probability, then in the order of the files, whose names a + joins.
+    """
+    cells: dict[str, dict[str, runs.Run]] = {}
+    for run in runs.load(files):
+        if run["method"] in PAIR:
+            cells.setdefault(str(_cell(run)), {})[run["method"]] = run
+    found = [(cell[PAIR[0]], cell[PAIR[1]]) for cell in cells.values() if len(cell) == len(PAIR)]
+    return sorted(found, key=lambda pair: share(pair[0]))
 
 
 def as_probe(files: pathlib.Path) -> str:
-    """F4SG against MAPPO-L with the same settings, probability and limit of true costs; a + joins the names of files.
+    """F4SG against MAPPO-L, a line a comparison; a + joins the names of files.
 
-    The tests are Welch's, corrected by Holm over the three measures of all pairs together. d is Cohen's.
+    The tests are Welch's. Holm corrects those of the harm over all lines, the other two with the harm's over the three
+    of their line. d is Cohen's.
     """
-    compared = [run for run in runs.load(files) if run["method"] in PAIR]
-    found = sorted(compared, key=lambda run: (*_cell(run), _rank(run)))
-    scores = [measures(run) for run in found]
-    pairs = [j for j in range(1, len(found)) if _cell(found[j]) == _cell(found[j - 1])]  # F4SG's row, after its other
-    order = ("training", "end", "reward")
-    p = holm([welch_test(scores[j][name], scores[j - 1][name]) for j in pairs for name in order])
-    corrected = {j: ", ".join(map(p_value, p[3 * k : 3 * k + 3])) for k, j in enumerate(pairs)}
+    found = pairs(files)
+    scores = [(measures(theirs), measures(ours)) for theirs, ours in found]
+    tests = [[welch_test(ours[name], theirs[name]) for name in ours] for theirs, ours in scores]
+    harm = holm([line[0] for line in tests])
     body = []
-    for j, (run, own) in enumerate(zip(found, scores, strict=True)):
-        line = [f"{share(run):g}", f"{_limit(run):g}", NAMES[run["method"]], *(mean_sd(own[name]) for name in order)]
-        effect = (_effect(own["training"], scores[j - 1]["training"]), corrected[j]) if j in corrected else ("-", "-")
-        body.append([*line, unsafe(run, own), *effect])
-    head = ["p", "limit", "method", "harm: costly steps per 1,000, training", "true cost at the end", "reward"]
-    head += ["seeds beyond the limit", "harm less MAPPO-L's [95 %], d", "corrected p: harm, cost, reward"]
-    return markdown(head, body)
+    for i, (theirs, ours) in enumerate(scores):
+        run, p = found[i][0], map(p_value, (harm[i], *holm(tests[i])[1:]))
+        line = [f"`{run['task']}`", f"{share(run):g}", f"{_limit(run):g}", mean_sd(theirs["training"])]
+        line += [mean_sd(ours["training"]), _effect(ours["training"], theirs["training"])]
+        line += [f"{mean_sd(theirs[name])}, {mean_sd(ours[name])}" for name in ("end", "reward")]
+        body.append([*line, ", ".join(map(unsafe, found[i])), ", ".join(p)])
+    head = ["task", "p", "limit", "harm, of 1,000 steps: MAPPO-L", "F4SG", "difference [95 %], d, %"]
+    head += [f"{what}: MAPPO-L, F4SG" for what in ("true cost at the end", "reward", "seeds beyond")]
+    return markdown([*head, "corrected p: harm, cost, reward"], body)
+
+
+def as_harm(files: pathlib.Path) -> str:
+    """The harm of `as_probe` alone, for the README."""
+    found = pairs(files)
+    scores = [[measures(run)["training"] for run in pair] for pair in found]
+    p = holm([welch_test(ours, theirs) for theirs, ours in scores])
+    body = []
+    for pair, (theirs, ours), corrected in zip(found, scores, p, strict=True):
+        line = [f"`{pair[0]['task']}`", f"{share(pair[0]):g}", mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
+        body.append([*line, p_value(corrected), *map(unsafe, pair)])
+    head = ["task", "p", "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p"]
+    return markdown([*head, "seeds beyond: MAPPO-L", "F4SG"], body)
 
 
 def _cell(run: runs.Run) -> tuple[float, float, list[tuple[str, str]]]:
     """What F4SG and MAPPO-L have in common if they are compared: p, limit and all settings but the sample's."""
-    return share(run), -_limit(run), [(name, x) for name, x in runs.shared(run).items() if name != "method"]
+    return share(run), _limit(run), sorted((name, x) for name, x in runs.shared(run).items() if name != "method")
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:
-    """The difference of the means with its 95 % interval, and in standard deviations."""
+    """The difference of the means with its 95 % interval, in standard deviations, and as a share of theirs."""
     low, high = difference_interval(ours, theirs)
     difference = ours.mean() - theirs.mean()
     spread = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 2)
-    return f"{difference:.1f} [{low:.1f}, {high:.1f}], {difference / spread if spread else 0:.1f}"
+    in_sd = difference / spread if spread else 0
+    return f"{difference:.1f} [{low:.1f}, {high:.1f}], {in_sd:.1f}, {_change(ours, theirs)}"
+
+
+def _change(ours: Scores, theirs: Scores) -> str:
+    return f"{100 * (ours.mean() / theirs.mean() - 1):.0f} %"
 
 
 def _limit(run: runs.Run) -> float:
@@ -106,4 +138,4 @@ def p_value(value: float) -> str:
     return "< .001" if value < 0.001 else f"{value:.3f}".lstrip("0") if value < 1 else "1"
 
 
-KINDS: dict[str, Callable[[pathlib.Path], str]] = {"weights": as_weights, "probe": as_probe}
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {"weights": as_weights, "probe": as_probe, "harm": as_harm}

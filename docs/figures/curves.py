@@ -31,7 +31,7 @@ FIGURES = {
     "velocity_ant_2x4": "velocity_h200",
     "velocity_half_cheetah_2x3": "velocity_h200",
     "grid_33": "table3_voltage_33_h200",
-    "harm": "fear_ant_2x4_h200",
+    "harm": "fear_h200",
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
 GRID_PANELS = {  # Fig. 3 of the paper
@@ -92,7 +92,8 @@ def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     for name in names or FIGURES:
         found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
-        found = [run for run in found if run["task"] == name] or found  # a file of several tasks
+        task = "ant_2x4" if name == "harm" else name
+        found = [run for run in found if run["task"] == task] or found  # a file of several tasks
         panels = {"grid_33": GRID_PANELS, "harm": HARM_PANELS}.get(name, PANELS)
         draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png", panels)
         print(f"docs/{name}.png")
