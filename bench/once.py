@@ -26,8 +26,9 @@ from pmt_jax.learning.evaluation import EVALUATION_KEY
 from pmt_jax.learning.types import Best
 from pmt_jax.policies.evaluate import evaluate_baseline
 from pmt_jax.training import trainer
-from pmt_jax.training.checkpoint import Checkpoints, Provenance, newest, unpack
+from pmt_jax.training.checkpoint import Checkpoints, newest, unpack
 from pmt_jax.training.compile import compile_run
+from pmt_jax.training.provenance import Provenance
 
 from .cases import Case
 from .records import Record
