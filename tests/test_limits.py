@@ -23,8 +23,8 @@ from pmt_jax.limits import Limits
 from pmt_jax.studies.rows import rows
 from pmt_jax.studies.run_log import read
 from pmt_jax.studies.table import summarise
+from pmt_jax.training.loop import Trainer
 from pmt_jax.training.metrics import METRICS, describe, judged_cost, make_rows
-from pmt_jax.training.trainer import Trainer
 
 LIMITS = st.lists(st.sampled_from([0.0, 0.1, 1.0, 4.8, 25.0]), min_size=1, max_size=3).map(tuple)
 AGENTS = st.integers(1, 4)

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
-from ..config.methods import label
 from ..errors import UsageError
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
@@ -118,8 +117,7 @@ def cache_events() -> Iterator[list[str]]:
 
 def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
-    config = setup.config
-    say(f"compiling {label(config.method)} on {setup.vector.spec.name} ...")
+    say(f"compiling {setup.label} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
     with compiling(_kernels(setup, say), say), tasks.announcing(say):
         state, programs, found = _compile_programs(setup, say)

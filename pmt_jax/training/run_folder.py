@@ -19,7 +19,6 @@ import jax.numpy as jnp
 
 from .. import numerics
 from ..config.load import load_config, to_toml
-from ..config.methods import label
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import fused, learner
@@ -287,7 +286,7 @@ class RunFolder:
 def create(setup: Setup) -> pathlib.Path:
     """A new folder runs/TASK-METHOD-TIME, with a number behind it if another run has taken the name."""
     task = re.sub(r"[^\w.+-]+", "-", setup.vector.spec.name).strip(".-") or "task"
-    name = f"{task}-{label(setup.config.method)}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{task}-{setup.label}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
     while True:
         out = pathlib.Path("runs") / (name if number == 1 else f"{name}-{number}")
