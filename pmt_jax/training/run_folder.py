@@ -332,9 +332,6 @@ def _keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
 
     If there is no checkpoint, all rows are kept under another name.
 
-    Args:
-      open_steps: the last steps of the checkpoint, of which there is no row yet.
-
     Returns:
       the rows up to `step`.
 
