@@ -8,7 +8,6 @@ notes how much of it went on.
 from __future__ import annotations
 
 import concurrent.futures
-import dataclasses
 import itertools
 import statistics
 import time
@@ -157,8 +156,8 @@ def training(case: Case) -> Build:
     sizes = {"seeds": case.seeds, "num_envs": case.num_envs, "rollout_length": case.rollout_length}
     engine = {"physics": case.physics} if case.physics else {}
     settings = sizes | engine | {"log_interval": updates, "steps": steps}
-    setup = make_setup(load_config(case.task, method=case.method, **settings, **dict(case.settings)))
-    setup = dataclasses.replace(setup, mesh=make_mesh(setup.config, case.devices), workers=case.workers)
+    config = load_config(case.task, method=case.method, **settings, **dict(case.settings))
+    setup = make_setup(config, mesh=make_mesh(config, case.devices), workers=case.workers)
 
     def build() -> Program:
         begin = time.perf_counter()

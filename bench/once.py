@@ -25,9 +25,10 @@ from pmt_jax import load_config, make_setup, tasks
 from pmt_jax.learning.evaluation import EVALUATION_KEY
 from pmt_jax.learning.types import Best
 from pmt_jax.policies.evaluate import evaluate_baseline
-from pmt_jax.training import trainer
-from pmt_jax.training.checkpoint import Checkpoints, Provenance, newest, unpack
+from pmt_jax.training import loop
+from pmt_jax.training.checkpoint import Checkpoints, newest, unpack
 from pmt_jax.training.compile import compile_run
+from pmt_jax.training.provenance import Provenance
 
 from .cases import Case
 from .records import Record
@@ -111,7 +112,7 @@ def checkpoint(case: Case) -> Record:
         "checkpoint_mb": round(size / 1e6, 3),
         "save_seconds": round(saving, 3),
         "load_seconds": round(statistics.median(load[1:]), 3),
-        "overhead": round(saving / trainer.CHECKPOINT_SECONDS + copying / training, 5),
+        "overhead": round(saving / loop.CHECKPOINT_SECONDS + copying / training, 5),
     }
 
 

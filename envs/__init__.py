@@ -74,8 +74,7 @@ def make(name: str, **options: Any) -> Env:
       >>> make("lane").spec.num_agents
       2
     """
-    cls, fixed = _class(name)
-    known = _options(cls, fixed)
+    cls, fixed, known = _find(name)
     for option in options:
         if option == "physics" and option not in known:
             raise TaskError(f"task '{name}' is plain JAX and has no physics engine to choose; leave physics = auto")
@@ -99,11 +98,7 @@ def task_options(name: str) -> dict[str, Any]:
     Raises:
       TaskError: unknown name.
     """
-    return _options(*_class(name))
-
-
-def _options(cls: Callable[..., Any], fixed: Mapping[str, Any]) -> dict[str, Any]:
-    return {p.name: p.default for p in inspect.signature(cls).parameters.values() if p.name not in fixed}
+    return _find(name)[2]
 
 
 def explain_options(name: str) -> str:
@@ -112,16 +107,20 @@ def explain_options(name: str) -> str:
     Raises:
       TaskError: unknown name.
     """
-    cls, fixed = _class(name)
+    cls, fixed, _ = _find(name)
     arguments = textwrap.dedent((inspect.getdoc(cls) or "").partition("Args:\n")[2])
     entries = re.split(r"\n(?=\S)", arguments)
     return "\n".join(entry for entry in entries if entry.partition(":")[0] not in fixed)
 
 
-def _class(name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+def _find(name: str) -> tuple[Callable[..., Any], dict[str, Any], dict[str, Any]]:
+    """What builds a task, the options that make this task of it, and those that are left, with their defaults."""
     if user.is_file(name):
-        return user.factory(name), {}
-    if name not in _TASKS:
+        cls, fixed = user.factory(name), {}
+    elif name in _TASKS:
+        task = _TASKS[name]
+        cls, fixed = getattr(importlib.import_module(f".{task.module}", __name__), task.cls), task.options
+    else:
         raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
-    task = _TASKS[name]
-    return getattr(importlib.import_module(f".{task.module}", __name__), task.cls), task.options
+    parameters = inspect.signature(cls).parameters.values()
+    return cls, fixed, {p.name: p.default for p in parameters if p.name not in fixed}

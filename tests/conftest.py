@@ -162,7 +162,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     The first process that asks for it trains it, all others wait. Nobody changes it.
     """
     from pmt_jax.cli import main
-    from pmt_jax.training import trainer
+    from pmt_jax.training import loop
     from runs import ARGUMENTS, STEPS
 
     base = tmp_path_factory.getbasetemp()
@@ -171,7 +171,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     with (base / "whole.lock").open("w") as lock, pytest.MonkeyPatch.context() as patch:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not out.exists():
-            patch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+            patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
             assert main([str(a) for a in ("train", *ARGUMENTS, "--steps", STEPS, "--out", making)]) == 0
             making.rename(out)
     return out

@@ -22,8 +22,8 @@ SAVES_EVERY_ROW = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where tests run in the background
 from pmt_jax.cli import main
-from pmt_jax.training import trainer
-trainer.CHECKPOINT_SECONDS = 0.0
+from pmt_jax.training import loop
+loop.CHECKPOINT_SECONDS = 0.0
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(main(sys.argv[1:]))
 """

@@ -23,8 +23,8 @@ from pmt_jax.limits import Limits
 from pmt_jax.studies.rows import rows
 from pmt_jax.studies.run_log import read
 from pmt_jax.studies.table import summarise
+from pmt_jax.training.loop import Trainer
 from pmt_jax.training.metrics import METRICS, describe, judged_cost, make_rows
-from pmt_jax.training.trainer import Trainer
 
 LIMITS = st.lists(st.sampled_from([0.0, 0.1, 1.0, 4.8, 25.0]), min_size=1, max_size=3).map(tuple)
 AGENTS = st.integers(1, 4)
@@ -138,8 +138,8 @@ def test_a_row_weighs_episodes_and_not_updates(updates: list[list[float]]):
     metrics = {"episodes": np.array([[len(x) for x in updates]]), "violation_rate": means}
     metrics |= {name: means for name, metric in METRICS.items() if metric.reduction == "episodes"}
     metrics |= {"episode_cost/agent_1": means, "true_episode_cost/0": means}
-    config = types.SimpleNamespace(seed=0, method="happo")
-    setup: Any = types.SimpleNamespace(config=config, limits_of_seeds=[Limits((1.0,))])
+    config = types.SimpleNamespace(seed=0)
+    setup: Any = types.SimpleNamespace(config=config, label="happo", limits_of_seeds=[Limits((1.0,))])
     setup.vector = types.SimpleNamespace(spec=types.SimpleNamespace(name="lane"))
     (found,) = make_rows(setup, 100, metrics)
     every = list(itertools.chain(*updates))
@@ -157,7 +157,8 @@ def test_the_worst_agent_of_a_row_is_one_agent():
     metrics = {"episodes": np.ones((1, 2)), "episode_cost": each.mean(-1), "episode_cost_worst": each.max(-1)}
     metrics |= {f"episode_cost/agent_{i}": each[..., i] for i in range(2)}
     setup: Any = types.SimpleNamespace(
-        config=types.SimpleNamespace(seed=0, method="happo"),
+        config=types.SimpleNamespace(seed=0),
+        label="happo",
         limits_of_seeds=[Limits((1.0,))],
         vector=types.SimpleNamespace(spec=types.SimpleNamespace(name="lane")),
     )

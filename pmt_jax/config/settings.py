@@ -207,17 +207,6 @@ class Config(Hyper):
         return dataclasses.replace(self, **changes)
 
 
-def differences(old: Config, new: Config) -> dict[str, str]:
-    """{field: 'old -> new'} of the settings that are not the same; a nan is the same as a nan."""
-
-    def shown(config: Config, name: str) -> str:
-        value = getattr(config, name)
-        return ", ".join(f"{option}={x}" for option, x in value) or "none" if name == "env" else repr(value)
-
-    pairs = {f.name: (shown(old, f.name), shown(new, f.name)) for f in dataclasses.fields(Config)}
-    return {name: f"{a} -> {b}" for name, (a, b) in pairs.items() if a != b}
-
-
 FIELDS: dict[str, Any] = typing.get_type_hints(Config)
 HYPER_FIELDS: tuple[str, ...] = tuple(f.name for f in dataclasses.fields(Hyper))
 

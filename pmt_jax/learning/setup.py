@@ -50,6 +50,16 @@ class Setup:
     debug: bool = False
 
     @property
+    def label(self) -> str:
+        """What rows, tables and folders call the method."""
+        return label(self.config.method)
+
+    @property
+    def asked_limits(self) -> Limits | None:
+        """The limits that the settings name; None if they leave them to the task."""
+        return Limits.configured(self.config, self.vector.spec.num_costs)
+
+    @property
     def limits(self) -> Limits:
         """What the learner holds the costs of every agent to, as it observes them."""
         return Limits.of_run(self.config, self.vector.spec)
@@ -105,16 +115,27 @@ def limit_less_margin(hyper: Hyper, margin: jax.Array | float) -> jax.Array:
     return jnp.asarray(hyper.cost_limit) * (1 - margin)
 
 
-def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
+def make_setup(
+    config: Config,
+    env: tasks.Env | None = None,
+    *,
+    trials: Trials | None = None,
+    mesh: jax.sharding.Mesh | None = None,
+    workers: int = 1,
+    debug: bool = False,
+) -> Setup:
     """Builds the task and the networks of a run.
 
     Args:
       env: an environment of your own, in place of `config.task`.
+      trials, mesh, workers, debug: as in `Setup`.
 
     Raises:
       UsageError: a `config` that is no Config, unknown task or task option, an engine that cannot run here, an `env`
-        that breaks the contract, or a setting of JAX that no program runs with.
+        that breaks the contract, `debug` on several devices, or a setting of JAX that no program runs with.
     """
+    if debug and mesh:
+        raise UsageError("--debug runs on one device in one process; leave out --devices")
     if found := numerics.obstacle():
         raise UsageError(found)
     if not isinstance(config, Config):
@@ -138,4 +159,4 @@ def make_setup(config: Config, env: tasks.Env | None = None) -> Setup:
         )
     nets = networks.build(config, env.spec, method)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")
-    return Setup(config, method, vector, nets)
+    return Setup(config, method, vector, nets, trials, mesh, workers, debug)

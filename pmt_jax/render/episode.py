@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
-from ..config.methods import label
 from ..learning.evaluation import EVALUATION_KEY
 from ..learning.setup import Setup
 from ..learning.types import ActingState
@@ -139,7 +138,7 @@ def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
     moments["cost"] = costs.mean(1)
     sums = {"reward_sum": moments["reward"].cumsum(), "cost_sum": costs.cumsum(0).max(1)}
     steps = np.arange(len(broken))
-    whole = Episode(setup.vector.env, label(setup.config.method), seed, setup.limits, step=steps, **moments, **sums)
+    whole = Episode(setup.vector.env, setup.label, seed, setup.limits, step=steps, **moments, **sums)
     return whole.cut(slice(length))
 
 

@@ -17,13 +17,14 @@ import jax
 import jax.numpy as jnp
 
 from ..config.load import load_config, to_toml
-from ..config.settings import HYPER_FIELDS, Config, differences
+from ..config.settings import HYPER_FIELDS, Config
 from ..errors import UsageError
 from ..files import writing
 from ..learning.setup import Trials, make_setup
 from ..policies import warm_start
 from ..training import final, lock, trainer
-from ..training.checkpoint import Checkpoints, Provenance
+from ..training.checkpoint import Checkpoints
+from ..training.provenance import Provenance, differences
 from ..training.run_folder import Rescue, Say, load_saved
 from . import jobs, program_folder, table
 from .points import Part, Points, drawn

@@ -9,15 +9,12 @@ takes what a checkpoint holds from the newest one, and would read none where tha
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
-import json
 import logging
 import os
 import pathlib
-import tomllib
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -25,14 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from ..config.load import load_config, to_toml
-from ..config.settings import Config, differences
 from ..errors import UsageError
 from ..learning import sharding
-from ..learning.setup import Setup
-from ..tasks import is_file
 from . import processes
 from .history import checkpoint_steps
+from .provenance import Provenance
 
 KEEP = 2
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
@@ -111,57 +105,6 @@ def _from_bytes(array: np.ndarray) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-@dataclasses.dataclass(frozen=True)
-class Provenance:
-    """What a checkpoint belongs to.
-
-    Attributes:
-      config: the settings of its run.
-      trials: of a program of a sweep, {setting: its value in each trial}, and their seeds as `seed`; else empty.
-    """
-
-    config: Config
-    trials: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def of(cls, setup: Setup) -> Provenance:
-        """What checkpoints of this setup belong to."""
-        if setup.trials is None:
-            return cls(setup.config)
-        traced = {"seed": setup.trials.seed, **vars(setup.trials.hyper)}
-        return cls(setup.config, {name: np.asarray(x).tolist() for name, x in traced.items()})
-
-    def to_bytes(self, step: int) -> np.ndarray:
-        """[bytes] uint8, JSON: what is said of the checkpoint after `step`."""
-        seeds = self.trials.get("seed") or [self.config.seed + i for i in range(self.config.seeds)]
-        said = {"step": step, "seeds": seeds, "settings": to_toml(self.config), "trials": self.trials}
-        return np.frombuffer(json.dumps(said).encode(), np.uint8)
-
-    @classmethod
-    def from_bytes(cls, data: np.ndarray) -> tuple[int, Provenance]:
-        """The inverse of `to_bytes`.
-
-        Raises:
-          UsageError: it has settings that this version of pmt-jax does not know.
-        """
-        said = json.loads(data.tobytes())
-        return said["step"], cls(load_config(tomllib.loads(said["settings"])), said["trials"])
-
-    def differences(self, other: Provenance) -> dict[str, str]:
-        """{setting: 'ours -> theirs'} of all that differs but the steps to train.
-
-        A Python file is the same task in another folder. Trials are not compared where one of both has none.
-        """
-        found = differences(self.config, other.config)
-        tasks = [provenance.config.task for provenance in (self, other)]
-        if all(map(is_file, tasks)) and len({pathlib.Path(task).name for task in tasks}) == 1:
-            found.pop("task", None)
-        if self.trials and other.trials:
-            pairs = {name: (repr(x), repr(other.trials.get(name))) for name, x in self.trials.items()}
-            found |= {f"{name} of the trials": f"{x} -> {y}" for name, (x, y) in pairs.items() if x != y}
-        return {name: change for name, change in found.items() if name != "steps"}
-
-
 class Saved(NamedTuple):
     """A checkpoint as it was read.
 
@@ -177,14 +120,6 @@ class Saved(NamedTuple):
     row: dict[str, np.ndarray]
     provenance: Provenance | None
     damaged: list[int]
-
-    def unexplained(self, config: Config, changes: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-        """{setting: 'its value here -> its value in `config`'} of what the run's later `changes` do not explain."""
-        if self.provenance is None:
-            return {}
-        found = self.provenance.differences(Provenance(config))
-        made = {name: x for row in changes if row["step"] >= self.step for name, x in row["changed"].items()}
-        return {name: x for name, x in found.items() if made.get(name, "").split(" -> ")[-1] != x.split(" -> ")[-1]}
 
 
 def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: bool = False) -> Saved:

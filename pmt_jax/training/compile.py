@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import tasks
-from ..config.methods import label
 from ..errors import UsageError
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
@@ -118,8 +117,7 @@ def cache_events() -> Iterator[list[str]]:
 
 def compile_run(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
     """The first state of all seeds, and the compiled programs that advance and evaluate it."""
-    config = setup.config
-    say(f"compiling {label(config.method)} on {setup.vector.spec.name} ...")
+    say(f"compiling {setup.label} on {setup.vector.spec.name} ...")
     begin = time.monotonic()
     with compiling(_kernels(setup, say), say), tasks.announcing(say):
         state, programs, found = _compile_programs(setup, say)
@@ -147,7 +145,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
         one = np.int32(1)
         compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(xla_options())
     programs = Programs(
-        functools.partial(_run_chunk, compiled, hyper),
+        lambda state, updates: compiled(hyper, state, np.int32(updates)),
         jax.jit(where_seed, donate_argnums=1),
         final=_final(setup),
     )
@@ -172,12 +170,6 @@ def _final(setup: Setup) -> Callable[[LearnerState], Metrics]:
             return jax.device_get(program(state))
 
     return run
-
-
-def _run_chunk(
-    program: Callable[..., tuple[LearnerState, Metrics]], hyper: Hyper, state: LearnerState, updates: int
-) -> tuple[LearnerState, Metrics]:
-    return program(hyper, state, np.int32(updates))
 
 
 def xla_options(once: bool = False) -> dict[str, str | bool] | None:

@@ -13,7 +13,6 @@ import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ..config.methods import label
 from ..files import Note, read_rows, replace_text, to_stderr
 from .history import Row
 
@@ -40,7 +39,7 @@ def rows(setup: Setup, step: int, results: Mapping[str, Any], left_out: set[int]
     """
     from .metrics import seed_intervals
 
-    named = {"step": step, "task": setup.vector.spec.name, "method": label(setup.config.method), "actions": "mean"}
+    named = {"step": step, "task": setup.vector.spec.name, "method": setup.label, "actions": "mean"}
     found = []
     for i, (measured, limits) in enumerate(zip(seed_intervals(results), setup.limits_of_seeds, strict=True)):
         if i in left_out:

@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..config.methods import label
 from ..learning.evaluation import interval
 from ..learning.setup import Setup
 from ..limits import WORST, Limits, base, judged, of_agents
@@ -141,7 +140,7 @@ def make_rows(setup: Setup, step: int, metrics: Mapping[str, np.ndarray]) -> lis
             "step": step,
             "seed": config.seed + i,
             "task": setup.vector.spec.name,
-            "method": label(config.method),
+            "method": setup.label,
             **limits.columns,
             "broken": None,
             **_worst_of_row({name: _reduce(name, np.asarray(x[i]), episodes[i]) for name, x in metrics.items()}),

@@ -1,16 +1,49 @@
-"""What can be known before training: that these settings cannot hold costs to the limit, or are not the paper's."""
+"""What can be said before training: what is trained, where, and whether these settings can do what was asked for."""
 
 from __future__ import annotations
 
 import math
+import os
+import pathlib
 
+import jax
+
+from .. import tasks
 from ..config.load import convert, read_preset
-from ..config.methods import label
 from ..config.settings import Config
 from ..learning.setup import Setup
 from ..limits import Limits
+from ..output import Say
 
 LITTLE = 1.5  # times what it began as: a multiplier that grows by less has hardly moved
+
+
+def describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
+    """Prints what will be trained, with what, into which run folder, and the `notes` about it."""
+    config, device = setup.config, jax.devices()[0]
+    steps = config.num_updates * config.batch_size
+    threads = f", {len(os.sched_getaffinity(0))} CPUs" if hasattr(os, "sched_getaffinity") else ""
+    seeds = f"{config.seeds} seed(s) from {config.seed}"
+    if setup.trials:
+        seeds = f"{config.seeds} runs, seeds {setup.trials.seed.min()} to {setup.trials.seed.max()}"
+    say(f"pmt: {setup.label} on {config.task}, {seeds}, into {out}")
+    say(f"device {device.device_kind} ({device.platform}{threads}), physics engine {setup.vector.env.engine}")
+    if config.physics == "auto" and (advice := tasks.advice(setup.vector.env)):
+        say(advice)
+    if setup.mesh:
+        parts, environments = setup.mesh.devices.shape
+        say(
+            f"{setup.mesh.size} devices in {jax.process_count()} process(es): seeds in {parts} part(s), "
+            f"each seed's environments in {environments}"
+        )
+    if setup.workers > 1:
+        say(f"{setup.workers} worker processes share the seeds and the CPUs")
+    say(
+        f"batch {config.num_envs} environments x {config.rollout_length} steps = {config.batch_size:,} a seed, "
+        f"{config.num_updates:,} updates = {steps:,} steps a seed"
+    )
+    for line in notes(setup):
+        say(line)
 
 
 def notes(setup: Setup) -> list[str]:
@@ -32,15 +65,15 @@ def _of_letter(setup: Setup) -> list[str]:
         return []
     more = f" and {len(other) - 3} more" if len(other) > 3 else ""
     return [
-        f"note: {label(config.method)} has the paper's equations, and these settings differ from its text: "
+        f"note: {setup.label} has the paper's equations, and these settings differ from its text: "
         f"{', '.join(other[:3])}{more}; --preset letter has them all"
     ]
 
 
 def _of_limit(setup: Setup) -> list[str]:
     """A sentence for each reason why the limit that was asked for may not be kept; none if the task's own is used."""
-    config, spec = setup.config, setup.vector.spec
-    given, method = Limits.configured(config, spec.num_costs), label(config.method)
+    config = setup.config
+    given, method = setup.asked_limits, setup.label
     if given is None or setup.trials is not None:
         return []
     if setup.method.constraint == "none":

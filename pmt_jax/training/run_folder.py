@@ -19,7 +19,6 @@ import jax.numpy as jnp
 
 from .. import numerics
 from ..config.load import load_config, to_toml
-from ..config.methods import label
 from ..errors import UsageError
 from ..files import read_rows, replace_text
 from ..learning import fused, learner
@@ -28,13 +27,12 @@ from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
 from . import final, lock, processes
-from .checkpoint import Checkpoints, Provenance, Saved, check_name, newest, unpack
+from .checkpoint import Checkpoints, Saved, check_name, newest, unpack
 from .history import Row, checkpoint_steps, missing_rows, read_changes
 from .loggers import Jsonl, Logger, open_loggers
+from .provenance import Provenance, check_machine, check_settings, listed, recorded_versions
 
 PACKAGES = ("pmt-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-# What --change keeps: who the run is, and what is read at its start only.
-FIXED = ("task", "method", "seed", "seeds", "init", "num_envs", "rollout_length", "episode_starts")
 BEFORE_START = ("versions.json",)  # what a run that was killed at its start may leave
 MATMUL_PRECISION = "highest"  # NVIDIA's default, TF32, changes results
 
@@ -79,7 +77,7 @@ class RunFolder:
 
         Args:
           resume: it holds a run to continue, which `saved` is then of; otherwise it must hold none.
-          change: the settings may differ from that run's, all but `FIXED`.
+          change: the settings may differ from that run's, all but `provenance.FIXED`.
 
         Raises:
           UsageError: another process has it, it holds something else, or the run was made with other settings, on
@@ -119,55 +117,15 @@ class RunFolder:
             return None
         saved = newest(self.path, self._say, to_continue=True) if checkpoint_steps(self.path) else None
         self._changes = read_changes(self.path)
-        self._same_settings(saved, change)
-        self._same_machine()
-        return saved
-
-    def _same_settings(self, saved: Saved | None, change: bool) -> None:
-        """Only `steps` may change when a run is continued; with `change` all settings but FIXED."""
-        file = self.path / "config.toml"
-        self._run, edited = Provenance(load_config(file)), {}
+        written, edited = load_config(existing), {}
+        self._run = Provenance(written)
         if saved and saved.provenance:
-            edited = saved.unexplained(self._run.config, self._changes)
-            config = saved.provenance.config if edited else self._run.config
-            self._run = Provenance(config, saved.provenance.trials)
-        changed = self._run.differences(self._provenance)
-        refused = {name: x for name, x in changed.items() if name in FIXED or not change}
+            edited = saved.provenance.unexplained(saved.step, written, self._changes)
+            self._run = Provenance(saved.provenance.config if edited else written, saved.provenance.trials)
+        check_settings(self.path, self._run, self._provenance, edited, change, self._say)
         self._is_edited = bool(edited)
-        if edited and not changed:
-            self._say(
-                f"{file} was edited since the checkpoint; the run continues with the settings it had:{listed(edited)}"
-            )
-        if not refused:
-            return
-        advice = "resume it unchanged (only --steps may grow), add --change to continue with the new ones"
-        if change:
-            advice = f"--change cannot change {', '.join(refused)}; leave them as they are"
-        elif edited:
-            advice = f"{file} was edited since; mend it, add --change to continue with what it says"
-        raise UsageError(
-            f"the run in {self.path} was made with other settings; {advice}, or choose another --out:{listed(refused)}"
-        )
-
-    def _same_machine(self) -> None:
-        """Refuses another engine or other random numbers; says which versions changed, which costs the last bits."""
-        old = recorded_versions(self.path)
-        if old is None:
-            file = self.path / "versions.json"
-            self._say(f"{file} cannot be read: the engine and the versions of the run are unknown")
-            return
-        new = versions(self._setup)
-        if old.get("engine", new["engine"]) != new["engine"]:
-            raise UsageError(
-                f"the run in {self.path} was simulated by engine '{old['engine']}', but physics = "
-                f"{self._setup.config.physics} means '{new['engine']}' on this {new['device']}, whose numbers differ; "
-                f"resume it where '{old['engine']}' runs, or choose another --out"
-            )
-        plain = [name for name in new if name in old and not isinstance(new[name], dict)]
-        changed = [f"{name} {old[name]} -> {new[name]}" for name in plain if old[name] != new[name]]
-        changed += numerics.changes(old, new, self.path)
-        if changed:
-            self._say(f"changed since the run began: {', '.join(changed)}; the run may not continue bit for bit")
+        check_machine(self.path, self._setup.config.physics, versions(self._setup), self._say)
+        return saved
 
     # -----------------------------------------------------------------------------------------------------------------
     # Writing
@@ -328,7 +286,7 @@ class RunFolder:
 def create(setup: Setup) -> pathlib.Path:
     """A new folder runs/TASK-METHOD-TIME, with a number behind it if another run has taken the name."""
     task = re.sub(r"[^\w.+-]+", "-", setup.vector.spec.name).strip(".-") or "task"
-    name = f"{task}-{label(setup.config.method)}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{task}-{setup.label}-{time.strftime('%Y%m%d-%H%M%S')}"
     number = 1
     while True:
         out = pathlib.Path("runs") / (name if number == 1 else f"{name}-{number}")
@@ -354,14 +312,6 @@ def _check_path(out: pathlib.Path, resume: bool) -> None:
         raise UsageError(f"there is no run to resume in {out}: it has no config.toml")
 
 
-def recorded_versions(out: pathlib.Path) -> dict[str, Any] | None:
-    """What versions.json holds; None if it cannot be read."""
-    try:
-        return dict(json.loads((out / "versions.json").read_text()))
-    except (OSError, ValueError, TypeError):
-        return None
-
-
 def versions(setup: Setup) -> dict[str, Any]:
     """What the results of a run depend on besides its settings."""
     found: dict[str, Any] = {name: installed_version(name) for name in PACKAGES}
@@ -381,9 +331,6 @@ def _keep_rows_until(out: pathlib.Path, step: int, say: Say) -> list[Row]:
     """Drops the rows after the checkpoint that the run continues from, and a line that was cut off.
 
     If there is no checkpoint, all rows are kept under another name.
-
-    Args:
-      open_steps: the last steps of the checkpoint, of which there is no row yet.
 
     Returns:
       the rows up to `step`.
@@ -452,7 +399,8 @@ def load_saved(
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     saved = _newest(folder, warn)
-    if edited := saved.unexplained(config, read_changes(folder)):
+    changes = read_changes(folder)
+    if edited := saved.provenance.unexplained(saved.step, config, changes) if saved.provenance else {}:
         raise UsageError(
             f"{folder / 'config.toml'} does not say what the checkpoint after {saved.step:,} steps was trained with; "
             f"mend that file, or move the checkpoint elsewhere if it is of another run:{listed(edited)}"
@@ -463,8 +411,3 @@ def load_saved(
 
 
 _newest = processes.in_first(newest)
-
-
-def listed(changed: Mapping[str, str]) -> str:
-    """Settings and what differs in them, a line each."""
-    return "".join(f"\n  {name}: {x}" for name, x in changed.items())

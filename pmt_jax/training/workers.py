@@ -22,7 +22,6 @@ import jax
 import numpy as np
 
 from .. import numerics
-from ..config.methods import label
 from ..config.settings import Config
 from ..errors import UsageError
 from ..learning.setup import Setup, make_setup
@@ -77,7 +76,7 @@ def start_workers(setup: Setup, say: Say) -> tuple[LearnerState, Programs]:
       UsageError: what `compile_run` raises.
     """
     config = setup.config
-    say(f"compiling {label(config.method)} on {setup.vector.spec.name} in every worker ...")
+    say(f"compiling {setup.label} on {setup.vector.spec.name} in every worker ...")
     workers = Workers(setup)
     try:
         states, measures, said = zip(*map(workers.receive, range(setup.workers)), strict=True)

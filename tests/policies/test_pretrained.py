@@ -29,7 +29,8 @@ from pmt_jax.learning.maths import running_moments
 from pmt_jax.learning.types import ActingState, Best, LearnerState, RunningMoments, TrainState
 from pmt_jax.policies import evaluate, hub, numpy_policy, publish
 from pmt_jax.training import run_folder
-from pmt_jax.training.checkpoint import Checkpoints, Provenance
+from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.provenance import Provenance
 
 NAMES = hub.names()
 WITH_THE_PACKAGE = hub.FOLDER

@@ -21,7 +21,8 @@ from pmt_jax.policies import publish
 from pmt_jax.policies.load import trusting
 from pmt_jax.render import episode
 from pmt_jax.training import run_folder
-from pmt_jax.training.checkpoint import Checkpoints, Provenance
+from pmt_jax.training.checkpoint import Checkpoints
+from pmt_jax.training.provenance import Provenance
 from runs import rows
 
 TASK = """

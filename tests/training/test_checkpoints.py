@@ -18,6 +18,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.learning.setup import Trials
 from pmt_jax.training import checkpoint
 from pmt_jax.training.history import missing_rows, row_steps
+from pmt_jax.training.provenance import Provenance
 from runs import ARGUMENTS, STEPS, assert_same_run, rows
 
 RESUME = ("train", *ARGUMENTS, "--steps", STEPS, "--resume", "--out")
@@ -216,11 +217,11 @@ def test_the_trials_of_a_sweep_belong_to_its_checkpoint():
     setup = make_setup(load_config("lane", "mappo_l", num_envs=4, seeds=2))
     hyper = setup.hyper
     trials = [Trials(hyper, jnp.array(seeds)) for seeds in ([0, 1], [0, 2])]
-    ours, theirs = (checkpoint.Provenance.of(type(setup)(setup.config, *_rest(setup), trials=x)) for x in trials)
+    ours, theirs = (Provenance.of(type(setup)(setup.config, *_rest(setup), trials=x)) for x in trials)
     assert ours.differences(theirs) == {"seed of the trials": "[0, 1] -> [0, 2]"} and not ours.differences(ours)
-    step, back = checkpoint.Provenance.from_bytes(ours.to_bytes(400))
+    step, back = Provenance.from_bytes(ours.to_bytes(400))
     assert step == 400 and not back.differences(ours) and back.trials["seed"] == [0, 1]
-    assert not ours.differences(checkpoint.Provenance(setup.config))
+    assert not ours.differences(Provenance(setup.config))
 
 
 def _rest(setup) -> tuple:
@@ -229,7 +230,7 @@ def _rest(setup) -> tuple:
 
 def test_a_file_of_ones_own_is_the_same_task_elsewhere(tmp_path: pathlib.Path):
     here, there, other = (
-        checkpoint.Provenance(load_config("lane").replace(task=str(tmp_path / name)))
+        Provenance(load_config("lane").replace(task=str(tmp_path / name)))
         for name in ("a/env.py:Mine", "b/env.py:Mine", "a/env.py:Yours")
     )
     assert not here.differences(there) and here.differences(other).keys() == {"task"}
@@ -299,10 +300,10 @@ def test_a_report_says_once_and_plainly_what_it_passes_over(copy: pathlib.Path, 
 
 def test_what_is_written_is_what_is_read():
     config = load_config("lane", "f4sg", cost_limit=2.5, seeds=3, seed=4)
-    provenance = checkpoint.Provenance(config)
+    provenance = Provenance(config)
     written = provenance.to_bytes(1234)
     assert json.loads(np.asarray(written).tobytes())["seeds"] == [4, 5, 6]
-    assert checkpoint.Provenance.from_bytes(written) == (1234, provenance)
+    assert Provenance.from_bytes(written) == (1234, provenance)
     unknown = json.loads(written.tobytes()) | {"settings": 'task = "lane"\nnever = 1\n'}
     with pytest.raises(UsageError, match="unknown setting 'never'"):
-        checkpoint.Provenance.from_bytes(np.frombuffer(json.dumps(unknown).encode(), np.uint8))
+        Provenance.from_bytes(np.frombuffer(json.dumps(unknown).encode(), np.uint8))

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pmt_jax.cli import main
-from pmt_jax.training import checkpoint, lock, loggers, trainer
+from pmt_jax.training import checkpoint, lock, loggers, loop, trainer
 from runs import ARGUMENTS, STEPS, assert_same_run, rows, saved
 
 RUN = ("train", *ARGUMENTS, "--steps", STEPS)
@@ -101,7 +101,7 @@ REST = {(what, step): pytest.mark.full if step == 600 else pytest.mark.slow for 
 def test_a_run_whose_folder_is_gone_is_saved_beside_it_and_goes_on_bit_for_bit(
     what: Callable, step: int, whole: pathlib.Path, tmp_path: pathlib.Path, cli, happens, monkeypatch
 ):
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     out = tmp_path / "runs" / "a b"
     happens(what, out, step)
     seen: list[dict[str, bytes]] = []

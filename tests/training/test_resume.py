@@ -22,14 +22,15 @@ from pmt_jax import load_config, load_policy
 from pmt_jax.errors import UsageError
 from pmt_jax.policies import load
 from pmt_jax.studies import run_log
-from pmt_jax.training import checkpoint, chunks, loggers, run_folder, trainer
+from pmt_jax.training import checkpoint, chunks, loggers, loop, run_folder
+from pmt_jax.training.provenance import Provenance
 from runs import ARGUMENTS, STEPS, TINY, assert_same_run, environment, rows, stop_after_rows
 
 DIES = """
 import os, signal, sys
 from pmt_jax.cli import main
-from pmt_jax.training import trainer
-trainer.CHECKPOINT_SECONDS = 0.0
+from pmt_jax.training import loop
+loop.CHECKPOINT_SECONDS = 0.0
 saves = 0
 
 def die(event, arguments):
@@ -79,7 +80,7 @@ def test_a_signal_saves_and_the_command_continues(
 
 
 def test_a_full_disk_stops_the_run_and_nothing_saved_is_lost(whole: pathlib.Path, small_disk, cli, monkeypatch):
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     place, remount = small_disk
     out = place / "run"
     code, text, err = cli("train", *ARGUMENTS, "--steps", STEPS, "--out", out)
@@ -113,7 +114,7 @@ def test_a_run_of_more_steps_than_fit_into_int32_is_resumed(copy: pathlib.Path, 
     for state in (saved["last"], saved["best"].state):
         object.__setattr__(state, "update", jnp.full_like(state.update, updates))
     checkpoints = checkpoint.Checkpoints(copy)
-    checkpoints.save(step, saved, checkpoint.Provenance(setup.config))
+    checkpoints.save(step, saved, Provenance(setup.config))
     checkpoints.close()
     code, text, _ = cli("train", *ARGUMENTS, "--steps", step + 400, "--out", copy, "--resume")
     assert code == 0 and "resuming after 3,000,000,000 steps" in text and "done: 3,000,000,400 steps" in text
