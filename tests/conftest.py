@@ -22,7 +22,6 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's complaints about pro
 import jax
 import psutil
 import pytest
-from jax._src.interpreters import mlir
 
 # Tests compile far longer than they run: with the least of optimisation programs compile in a quarter of the time.
 # Without fused multiply-adds, which XLA places as it happens to fuse, programs that compute the same agree bit for bit.
@@ -38,8 +37,10 @@ _FLAGS = ("--xla_backend_optimization_level=0", _QUICK.get(_MINOR, ""), _NO_FMA,
 os.environ["XLA_FLAGS"] = " ".join(_FLAGS)
 
 CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
-jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+KEPT = {"jax_compilation_cache_dir": str(CACHE), "jax_persistent_cache_min_compile_time_secs": 0.1}
+for name, setting in KEPT.items():
+    jax.config.update(name, setting)
+    os.environ[name.upper()] = str(setting)  # for processes that tests start
 
 
 for number in (signal.SIGINT, signal.SIGHUP):  # ignored where tests run in the background or under nohup
@@ -66,10 +67,15 @@ def context_of_programs(make: Callable[[], Any]) -> Any:
 @pytest.fixture(autouse=True, scope="session")
 def programs_have_one_context():
     """JAX loads the dialects of MLIR anew for every program, which takes longer than to lower a small one."""
-    make = getattr(mlir, "make_ir_context", None)
+    try:
+        from jax._src.interpreters import mlir
+
+        make = mlir.make_ir_context
+    except (ImportError, AttributeError):  # private, so JAX may move it; then tests take longer
+        yield
+        return
     with pytest.MonkeyPatch.context() as patch:
-        if make:
-            patch.setattr(mlir, "make_ir_context", lambda: context_of_programs(make))
+        patch.setattr(mlir, "make_ir_context", lambda: context_of_programs(make))
         yield
 
 
@@ -146,12 +152,13 @@ def quick_doctor(monkeypatch: pytest.MonkeyPatch):
 def programs_are_shared():
     """Training and evaluations compile a program once a process (see `runs`)."""
     from pmt_jax.policies import evaluate
-    from pmt_jax.training import trainer
+    from pmt_jax.training import compile, trainer
     from runs import compile_once, evaluate_once
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer, "compile_run", compile_once)
-        patch.setattr(evaluate, "evaluate_seeds", evaluate_once)
+        for module in (compile, evaluate):
+            patch.setattr(module, "evaluate_seeds", evaluate_once)
         yield
 
 

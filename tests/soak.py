@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 from runs import ARGUMENTS, environment
 
-KINDS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT, "closed pipe", "full disk")
+KINDS = (signal.SIGKILL, "closed pipe", "full disk", signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 SAVES_EVERY_ROW = """
 import signal, sys

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -25,10 +25,10 @@ ROBOTS = ("corridor", "hopper", "walls", "swimmer", "humanoid", "ant", "half_che
 FULL = ("hopper", "walls", "humanoid")  # a planar robot, the corridor's ant next to solid walls, the largest robot
 
 
-def by_robot(*default: str) -> list[Any]:
+def by_robot(*default: str, full: Sequence[str] = FULL) -> list[Any]:
     """Parameters: of ROBOTS, those for the default tests, those for `-m full`, and the others, which run by hand."""
     late = [x for x in ROBOTS if x not in default]
-    return [*default, *(pytest.param(x, marks=pytest.mark.full if x in FULL else pytest.mark.slow) for x in late)]
+    return [*default, *(pytest.param(x, marks=pytest.mark.full if x in full else pytest.mark.slow) for x in late)]
 
 
 def sweep(robot: str) -> list[Any]:

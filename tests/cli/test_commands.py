@@ -85,7 +85,7 @@ cli.run(["version?"])
 @pytest.mark.full
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
     out = tmp_path / "long"
-    words = [str(a) for a in ("train", *ARGUMENTS, "--steps", "1e8", "--out", out)]
+    words = [str(a) for a in ("train", *ARGUMENTS, "--steps", "1e8", "--method", "mappo", "--out", out)]
     command = [sys.executable, "-c", CTRL_C, *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
     while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
@@ -101,19 +101,19 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: pathlib.Path):
 @pytest.mark.full
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path: pathlib.Path, cli):
     out = tmp_path / "broken"
-    code, text, _ = cli("train", *ARGUMENTS, "--steps", 2000, "--critic-lr", 1e38, "--out", out)
+    code, text, _ = cli("train", *ARGUMENTS, "--steps", STEPS, "--critic-lr", 1e38, "--out", out)
     assert code == 1
     assert (
         "stopped: critic/loss of seed 0 at step 200 is nan; single precision cannot train with critic_lr = 1e+38"
         in text
     )
-    assert rows(out)[-1]["step"] < 2000
+    assert rows(out)[-1]["step"] < STEPS
 
 
 @pytest.mark.full
 def test_output_that_nobody_reads_any_more(whole: pathlib.Path):
     command = f"{sys.executable} -m pmt_jax eval {whole} --episodes 2 | true"
-    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    buffered = {name: value for name, value in environment().items() if name != "PYTHONUNBUFFERED"}
     for variables in (buffered, buffered | {"PYTHONUNBUFFERED": "1"}):
         result = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True)
         assert "Traceback" not in result.stderr and "BrokenPipe" not in result.stderr

@@ -23,6 +23,7 @@ plain = Method(order="sequential", constraint="lagrangian")
 """
 TINY = ("--num-envs", 4, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--minibatches", 1)
 TINY += ("--epochs", 1, "--steps", 400, "--no-cache")
+TINY += ("--lambda-lr", 0)  # so that longer runs have the same program
 
 
 @pytest.fixture

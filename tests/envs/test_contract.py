@@ -35,14 +35,7 @@ SIBLINGS |= {name for name in ALL if name.startswith("multi_goal_") and name != 
 
 
 # A sibling of each kind of task with a robot, and those whose own tests step them on the engine of the default tests.
-FULL = (
-    "ant_4x2",
-    "velocity_humanoid_9_8",
-    "multi_goal_ant_2",
-    "velocity_hopper_3x1",
-    "multi_goal_point_0",
-    "voltage_33",
-)
+FULL = ("velocity_humanoid_9_8", "multi_goal_ant_2", "velocity_hopper_3x1", "multi_goal_point_0", "voltage_33")
 
 
 def each_task(*full: str, siblings: Sequence[str] = FULL):

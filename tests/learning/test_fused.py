@@ -209,7 +209,7 @@ def learned(state):
 
 # One actor or one each, critics of states or of observations, epochs or a trust region, fear and regret or neither:
 # what else methods differ in computes with these networks' results.
-NETWORKS = [("lane", "mappo"), ("lane", "ippo_l"), ("lane", "mixed"), ("ant_2x4", "macpo")]
+NETWORKS = [("lane", "mappo"), ("lane", "ippo_l"), ("lane", "mixed"), ("lane", "macpo")]
 
 
 @pytest.mark.parametrize(

@@ -306,12 +306,13 @@ def test_policies_loaded_exported_and_drawn_act_as_the_one_that_was_evaluated(
 @pytest.mark.full
 def test_a_picture_shows_what_the_policy_does(trained: pathlib.Path):
     shown = episode.record_run(trained, seed=1, deterministic=True)
-    env, policy, hidden = shown.env, load_policy(trained, seed=1), None
+    env, policy, hidden = shown.env, jax.jit(load_policy(trained, seed=1)), None
+    step = jax.jit(env.step)
     state = env.reset(jax.random.split(jax.random.fold_in(jax.random.key(episode.EVALUATION_KEY), 0))[0])
     for action in shown.action[1:]:
         mean, hidden = policy(state.obs, hidden)
         np.testing.assert_allclose(mean, action, rtol=1e-4, atol=1e-5)
-        state = env.step(state, mean)
+        state = step(state, mean)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +358,7 @@ def test_a_policy_in_the_hub(trained: pathlib.Path, tmp_path: pathlib.Path, monk
 @pytest.mark.full
 def test_a_run_starts_from_a_recurrent_one_but_not_from_another(trained: pathlib.Path, tmp_path: pathlib.Path, cli):
     out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--steps", 160, "--init", trained, "--out", out)[0] == 0
+    assert cli("train", *ARGUMENTS, "--steps", 640, "--init", trained, "--out", out)[0] == 0
     assert rows(out)[0]["critic/loss"] != rows(trained)[0]["critic/loss"]
     code, _, error = cli(
         "train",

@@ -49,13 +49,7 @@ def trainer(method: str) -> Callable[[float], tuple[LearnerState, dict[str, jax.
     return train
 
 
-FULL = (
-    "mappo_l",
-    "mixed",
-    "macpo",
-    "crpo",
-    "ippo_l",
-)  # every way to hold a limit, fear, regret, critics of observations
+FULL = ("mixed", "macpo", "crpo", "ippo_l")  # every way to hold a limit, fear, regret, critics of observations
 
 
 @pytest.mark.parametrize(

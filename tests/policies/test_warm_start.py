@@ -18,7 +18,7 @@ from pmt_jax.learning import learner
 from pmt_jax.learning.setup import Setup, make_setup
 from pmt_jax.learning.types import LearnerState
 from pmt_jax.policies import load, warm_start
-from runs import ARGUMENTS, rows
+from runs import ARGUMENTS, STEPS, rows
 
 SIZES = {"num_envs": 4, "rollout_length": 25, "hidden": (8,), "minibatches": 1}
 
@@ -68,7 +68,7 @@ def test_a_pretrained_policy_brings_what_acts():
 @pytest.mark.full
 def test_a_run_begins_there_and_says_so_in_its_settings(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)[0] == 0
+    assert cli("train", *ARGUMENTS, "--steps", STEPS, "--init", whole, "--out", out)[0] == 0
     assert load_config(out / "config.toml").init == str(whole)
     assert rows(out)[0]["fear/loss"] != rows(whole)[0]["fear/loss"]
 
@@ -78,7 +78,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
     whole: pathlib.Path, tmp_path: pathlib.Path, cli
 ):
     out = tmp_path / "run"
-    words = ("train", *ARGUMENTS, "--steps", 400, "--init", whole, "--out", out)
+    words = ("train", *ARGUMENTS, "--steps", STEPS, "--init", whole, "--out", out)
     assert cli(*words)[0] == 0
     before = rows(out)
     shutil.rmtree(out / "checkpoints")

@@ -189,12 +189,13 @@ def test_a_change_before_the_next_checkpoint_is_no_edit(copy: pathlib.Path, cli,
 @pytest.mark.full
 def test_a_checkpoint_of_another_run_or_step(whole: pathlib.Path, copy: pathlib.Path, tmp_path: pathlib.Path, cli):
     other = tmp_path / "other"
-    assert cli("train", *ARGUMENTS, "--seed", 7, "--steps", 2000, "--out", other)[0] == 0
-    shutil.copytree(other / "checkpoints" / "2000", copy / "checkpoints" / "2000")
+    later = str(STEPS + 200)
+    assert cli("train", *ARGUMENTS, "--seed", 7, "--steps", later, "--out", other)[0] == 0
+    shutil.copytree(other / "checkpoints" / later, copy / "checkpoints" / later)
     for words in (("eval", copy), (*RESUME, copy)):
         code, _, err = cli(*words)
         assert code == 2 and "seed: 7 -> 0" in err
-    shutil.rmtree(copy / "checkpoints" / "2000")
+    shutil.rmtree(copy / "checkpoints" / later)
     (copy / "checkpoints" / str(STEPS)).rename(copy / "checkpoints" / "99999")
     for words in (("eval", copy), (*RESUME, copy)):
         code, _, err = cli(*words)

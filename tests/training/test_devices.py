@@ -18,7 +18,8 @@ from pmt_jax.policies import load
 from pmt_jax.training import checkpoint, processes
 
 TINY = ("--rollout-length", 10, "--log-interval", 2, "--hidden", 8, "--minibatches", 2, "--epochs", 1)
-ARGUMENTS = ("train", "lane", "--num-envs", 4, *TINY, "--eval-interval", 2, "--eval-episodes", 2, "--seeds", 1)
+ARGUMENTS = ("train", "lane", "--method", "mappo", "--num-envs", 4, *TINY, "--seeds", 1)
+ARGUMENTS += ("--eval-interval", 2, "--eval-episodes", 2)
 # Of MACPO: from here its line search takes the first step at once. With seed 0 and the default it ends where rounding
 # decides whether a step is accepted, and on one machine of several the devices did not agree.
 ACCEPTED = {"seed": 2, "kl_limit": 1e-4}
@@ -26,9 +27,8 @@ FOUR = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Of a process of its own, which shares the tests' compile cache."""
-    cache = {"JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
-    return os.environ | cache | {"PYTHONPATH": str(ROOT)} | more
+    """Of a process of its own."""
+    return os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)} | more
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -117,10 +117,9 @@ def test_environments_split_under_a_trust_region():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("method", "sizes"), [("macpo", {"seeds": 1, **ACCEPTED}), ("mixed", {"seeds": 1}), ("mappo", {"seeds": 2})]
-)
+@pytest.mark.parametrize(("method", "sizes"), [("macpo", {"seeds": 1, **ACCEPTED}), ("mixed", {"seeds": 2})])
 def test_devices_of_a_cpu_fit_whole_networks(method: str, sizes: dict[str, float]):
+    """Below, two devices and two processes fit one actor of all agents."""
     found = compare("lane", method=method, num_envs=4, **sizes)
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["collectives"] and not in_fits(found["collectives"])

@@ -96,16 +96,6 @@ def test_an_evaluation_that_fails_costs_nothing_else(copy: pathlib.Path, cli, mo
     assert code == 0 and "note: the evaluation could not be made: out of memory" in text and "done:" in text
 
 
-@pytest.mark.full
-def test_workers_evaluate_as_one_process_does(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
-    out = tmp_path / "run"
-    assert cli("train", *ARGUMENTS, "--workers", 2, "--steps", STEPS, "--out", out)[0] == 0
-    for ours, theirs in zip(ends(out), ends(whole), strict=True):  # other shapes have other rounding
-        assert ours == {
-            name: pytest.approx(x, rel=1e-5, abs=1e-6) if isinstance(x, float) else x for name, x in theirs.items()
-        }
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Whether the limit was kept
 

@@ -30,7 +30,7 @@ pytestmark = [
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "howto" / "hosts.md"
 NODES = ("127.0.0.2", "127.0.0.3", "127.0.0.4")  # addresses for names, so that the processes find the first of them
 TINY = "lane --num-envs 4 --rollout-length 25 --hidden 8 --minibatches 1 --epochs 1 --no-cache"
-PATIENCE = 300.0  # seconds for whatever should happen
+PATIENCE = 300.0  # seconds for whatever should happen; a job that is requeued waits for the scheduler's next look
 
 CONFIGURATION = """
 ClusterName=emulated
@@ -51,6 +51,7 @@ SwitchType=switch/none
 MpiDefault=none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU
+SchedulerParameters=sched_interval=1,bf_interval=1
 SlurmdParameters=config_overrides
 ReturnToService=2
 SlurmdTimeout=10
@@ -176,7 +177,7 @@ def rows(run: pathlib.Path) -> list[dict]:
 
 def test_the_pages_script_saves_requeues_and_survives_a_node(cluster: Cluster):
     """It never ends by itself; what is compared is what two runs have in common, over all that befell one of them."""
-    training = f"{TINY} --method mappo_l --seeds 2 --log-interval 20 --steps 2e9"
+    training = f"{TINY} --method mappo --seeds 2 --log-interval 20 --steps 2e9"
     run, calm = cluster.top / "run", cluster.top / "calm"
 
     def last() -> int:
@@ -223,7 +224,7 @@ def test_the_pages_script_saves_requeues_and_survives_a_node(cluster: Cluster):
 def test_a_job_array_finishes_a_sweep(cluster: Cluster):
     out = cluster.top / "sweep"
     training = TINY.replace("--hidden 8 ", "")
-    words = f"pmt sweep {training} --method happo --steps 400 --set 'hidden=[4],[8]' --out {out}"
+    words = f"pmt sweep {training} --method mappo --steps 400 --set 'hidden=[4],[8]' --out {out}"
     job = cluster.submit(f"#!/bin/bash\n#SBATCH --array=1-2 --ntasks=1\n{words}\n", "--output=array-%a.txt")
     until("both points", lambda: len(list(out.glob("*/config.toml"))) == 2)
     until("an end", lambda: not cluster.call("squeue", "-h", "-j", job))

@@ -13,22 +13,33 @@ import psutil
 import pytest
 
 from pmt_jax import load_config
-from pmt_jax.training import workers
+from pmt_jax.training import final, workers
 from runs import ARGUMENTS, STEPS, assert_same_run, environment, rows, saved
 
-WORKERS = ("train", *ARGUMENTS, "--workers", 2)
+# Of a method that compiles fast, and whose runs do not depend on how long they are to be.
+ALONE = ("train", *ARGUMENTS, "--method", "mappo", "--eval-interval", 0)
+FAST = (*ALONE, "--workers", 2)
 
 
-STILL = ("--lambda-lr", 0)  # so that a run does not depend on how long it is to be
-
-
-def begun(out: pathlib.Path, *more: object) -> subprocess.Popen[str]:
+def begun(out: pathlib.Path) -> subprocess.Popen[str]:
     """A run in two workers that has written its first rows and has long to go."""
-    words = [str(word) for word in (*WORKERS, "--steps", 10**7, *STILL, "--out", out, *more)]
+    words = [str(word) for word in (*FAST, "--steps", 10**7, "--out", out)]
     command = [sys.executable, "-m", "pmt_jax", *words]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout and any(line.startswith("steps ") for line in process.stdout)
     return process
+
+
+def assert_together(out: pathlib.Path, first: pathlib.Path, second: pathlib.Path) -> None:
+    """A run is two others: its rows, its newest checkpoint and its last evaluation."""
+    ours = [row | {"seconds": 0} for row in rows(out)]
+    theirs = [row | {"seconds": 0} for row in (*rows(first), *rows(second))]
+    assert ours == sorted(theirs, key=lambda row: (row["step"], row["seed"]))
+    one, two = saved(first), saved(second)
+    for path, x in saved(out).items():
+        assert np.array_equal(x, np.concatenate([one[path], two[path]])), path
+    evaluated = [(folder / final.FILE).read_text() for folder in (out, first, second)]
+    assert evaluated[0] == evaluated[1] + evaluated[2]
 
 
 @pytest.mark.full
@@ -38,18 +49,14 @@ def test_a_workers_seeds_equal_the_run_of_these_seeds_alone(whole: pathlib.Path,
     code, text, err = cli("train", *ARGUMENTS, "--seeds", 3, "--workers", 2, "--steps", STEPS, "--out", out)
     assert (code, err) == (0, "") and "2 worker processes share the seeds and the CPUs" in text
     assert cli("train", *ARGUMENTS, "--seed", 2, "--seeds", 1, "--steps", STEPS, "--out", alone)[0] == 0
-    ours = [row | {"seconds": 0} for row in rows(out)]
-    theirs = [row | {"seconds": 0} for row in (*rows(whole), *rows(alone))]
-    assert ours == sorted(theirs, key=lambda row: (row["step"], row["seed"]))
-    first, second = saved(whole), saved(alone)
-    for path, x in saved(out).items():
-        assert np.array_equal(x, np.concatenate([first[path], second[path]])), path
+    assert_together(out, whole, alone)
 
 
 @pytest.mark.full
-def test_a_run_goes_on_in_workers(copy: pathlib.Path, cli):
-    code, text, err = cli(*WORKERS, "--steps", STEPS + 200, "--out", copy, "--resume")
-    assert (code, err) == (0, "") and rows(copy)[-1]["step"] == STEPS + 200
+def test_a_run_goes_on_in_workers(tmp_path: pathlib.Path, cli):
+    assert cli(*ALONE, "--steps", 200, "--out", tmp_path)[0] == 0
+    code, text, err = cli(*FAST, "--steps", 400, "--out", tmp_path, "--resume")
+    assert (code, err) == (0, "") and rows(tmp_path)[-1]["step"] == 400
     assert "changed since the run began: workers 1 -> 2; the run may not continue bit for bit" in text
 
 
@@ -63,9 +70,11 @@ def test_a_signal_saves_all_seeds_and_the_run_goes_on(tmp_path: pathlib.Path, cl
     assert (process.returncode, err) == (128 + signal.SIGTERM, "")  # together: an abort says why on stderr
     assert f"--out {tmp_path / 'run'} --resume --workers 2" in text.splitlines()[-1]
     goal = rows(tmp_path / "run")[-1]["step"] + STEPS // 4
-    assert cli(*WORKERS, *STILL, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
-    assert cli(*WORKERS, *STILL, "--steps", goal, "--out", tmp_path / "uninterrupted")[0] == 0
-    assert_same_run(tmp_path / "run", tmp_path / "uninterrupted")
+    assert cli(*FAST, "--steps", goal, "--out", tmp_path / "run", "--resume")[0] == 0
+    uninterrupted = [tmp_path / "first", tmp_path / "second"]
+    for seed, out in enumerate(uninterrupted):
+        assert cli(*ALONE, "--seed", seed, "--seeds", 1, "--steps", goal, "--out", out)[0] == 0
+    assert_together(tmp_path / "run", *uninterrupted)
 
 
 @pytest.mark.slow
@@ -79,8 +88,8 @@ def test_a_run_in_workers_whose_folder_is_gone_is_saved_beside_it(tmp_path: path
     assert f"in {saved}. Continue with: pmt train" in said and said.endswith("--resume --workers 2")
     assert not (tmp_path / "run").exists()
     step = rows(saved)[-1]["step"]
-    assert cli(*WORKERS, *STILL, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
-    assert cli(*WORKERS, *STILL, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
+    assert cli(*FAST, "--steps", step + 200, "--out", saved, "--resume")[0] == 0
+    assert cli(*FAST, "--steps", step + 200, "--out", tmp_path / "uninterrupted")[0] == 0
     assert_same_run(saved, tmp_path / "uninterrupted")
 
 
@@ -96,7 +105,8 @@ def test_a_worker_that_is_killed_loses_nothing_that_was_trained(tmp_path: pathli
     assert f"saved as of step {step:,}. Continue with: pmt train" in said
     psutil.wait_procs([first], timeout=60)
     assert not first.is_running()
-    assert cli(*WORKERS, *STILL, "--steps", step + 100, "--out", tmp_path / "run", "--resume")[0] == 0
+    code, text, _ = cli(*ALONE, "--steps", step + 100, "--out", tmp_path / "run", "--resume")
+    assert code == 0 and "changed since the run began: workers 2 -> 1" in text
 
 
 @pytest.mark.full

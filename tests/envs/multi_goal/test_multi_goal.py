@@ -289,8 +289,7 @@ def test_observations_are_standardised_over_their_own_entries():
     np.testing.assert_allclose(state, (y - y.mean()) / y.std(), atol=1e-5)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("agents", [2, 3])
+@pytest.mark.parametrize("agents", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.full)])
 def test_own_robots_see_each_other_and_pay_for_touching(agents):
     env, _, step, reset = own(agents)
     start = reset(jax.random.split(jax.random.key(2), 64))

@@ -222,7 +222,7 @@ def test_double_precision_goes_through():
         jax.config.update("jax_enable_x64", True)
         import envs
         env = envs.make("ant_2x4", physics="mujoco")
-        state = jax.jit(env.step)(env.reset(jax.random.key(0)), np.zeros((2, 4)))
+        state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(0)), np.zeros((2, 4)))
         assert state.obs.dtype == state.reward.dtype == np.float64, state.obs.dtype
         print("ok")
     """)
@@ -233,7 +233,7 @@ ROLL = """
 import os, signal, sys, threading, time
 import jax, jax.numpy as jnp, envs
 env = envs.make("ant_2x4", physics="mujoco", threads=2)
-state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 16))
+state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
 zero = jnp.zeros((16, *env.spec.action_mask.shape))
 roll = jax.jit(lambda s, n: jax.lax.fori_loop(0, n, lambda _, s: jax.vmap(env.step)(s, zero), s))
 jax.block_until_ready(roll(state, 2))

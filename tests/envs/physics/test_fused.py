@@ -82,7 +82,7 @@ def test_a_control_step_and_its_readouts_are_mujocos(robot, kind, full, monkeypa
     assert not ours["overflow"].any()
 
 
-@pytest.mark.parametrize("robot", by_robot())
+@pytest.mark.parametrize("robot", by_robot(full=("humanoid",)))
 def test_the_acceleration_is_mujocos(robot):
     """Of the very state: Euler's warm start after one substep. (By default `test_fused_threads` has it.)"""
     model, _ = model_of(robot)
@@ -93,7 +93,7 @@ def test_the_acceleration_is_mujocos(robot):
         check({"warmstart": ours["warmstart"]}, {"warmstart": theirs["warmstart"]}, 1e-8, 0.01)
 
 
-@pytest.mark.parametrize("robot", by_robot())
+@pytest.mark.parametrize("robot", by_robot(full=("walls",)))
 def test_the_float_build_is_mujocos_within_its_rounding(robot):
     """The GPU computes with the same formulae in float."""
     model, substeps = model_of(robot)
