@@ -28,7 +28,6 @@ FIGURES = {
     "table1_ant_4x2": "table1_ant_4x2_h200",
     "table2": "table2_h200",
     "table3_voltage_33": "table3_voltage_33_h200",
-    "velocity_ant_2x4": "velocity_h200",
     "velocity_half_cheetah_2x3": "velocity_h200",
     "grid_33": "table3_voltage_33_h200",
     "harm": "fear_h200",
