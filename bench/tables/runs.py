@@ -30,7 +30,7 @@ CURVES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode
 TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_seen have none
 # Stored as means over seeds.
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
-HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33_h200")  # the README's
+HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33")  # the README's
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
@@ -157,7 +157,7 @@ def as_paper(file: pathlib.Path) -> str:
 def as_summary(files: pathlib.Path) -> str:
     """Methods by tasks: mean reward / cost, and how many seeds keep the limit; a + joins the names of several files.
 
-    A method has its label where it has several settings in a task.
+    A method has its label where it has several settings in a task, and `-` where it has not run.
     """
     found = _summaries(files)
     often = collections.Counter((task, row.method) for (task, _), (row, _) in found.items())
@@ -168,7 +168,8 @@ def as_summary(files: pathlib.Path) -> str:
     tasks, methods = (list(dict.fromkeys(name)) for name in zip(*cells, strict=True))
     limits = {row.task: row.limits for row, _ in cells.values()}
     head = ["", *(f"`{task}` (limit {limits[task]})" for task in tasks)]
-    return markdown(head, [[f"`{method}`", *(cells[task, method][1] for task in tasks)] for method in methods])
+    words = {cell: text for cell, (_, text) in cells.items()}
+    return markdown(head, [[f"`{name}`", *(words.get((task, name), "-") for task in tasks)] for name in methods])
 
 
 def as_overview(files: pathlib.Path) -> str:

@@ -27,9 +27,9 @@ FIGURES = {
     "table1_ant_2x4": "table1_ant_2x4_h200",
     "table1_ant_4x2": "table1_ant_4x2_h200",
     "table2": "table2_h200",
-    "table3_voltage_33": "table3_voltage_33_h200",
+    "table3_voltage_33": "table3_voltage_33",
     "velocity_half_cheetah_2x3": "velocity_h200",
-    "grid_33": "table3_voltage_33_h200",
+    "grid_33": "table3_voltage_33",
     "harm": "fear_h200",
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}

@@ -550,6 +550,8 @@ def test_an_overview_has_multipliers_with_pid_only(tmp_path: pathlib.Path):
     assert [line.split(" | ")[0] for line in lines] == ["| `lane`", "| `switch`"]
     (lane, switch) = runs.as_overview(tmp_path / "mappo+switch.json").splitlines()[2:]
     assert lane.endswith(" | - |") and " - " not in switch
+    *_, missing = runs.as_summary(tmp_path / "mappo+switch.json").splitlines()
+    assert missing.startswith("| `f4sg` | - | ")
 
 
 @pytest.mark.full
