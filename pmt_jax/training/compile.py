@@ -145,7 +145,7 @@ def _compile_programs(setup: Setup, say: Say) -> tuple[LearnerState, Programs, s
         one = np.int32(1)
         compiled = debug.checked(program) if setup.debug else program.lower(hyper, state, one).compile(xla_options())
     programs = Programs(
-        lambda state, updates: compiled(hyper, state, np.int32(updates)),
+        functools.partial(_run_chunk, compiled, hyper),
         jax.jit(where_seed, donate_argnums=1),
         final=_final(setup),
     )
@@ -170,6 +170,12 @@ def _final(setup: Setup) -> Callable[[LearnerState], Metrics]:
             return jax.device_get(program(state))
 
     return run
+
+
+def _run_chunk(
+    program: Callable[..., tuple[LearnerState, Metrics]], hyper: Hyper, state: LearnerState, updates: int
+) -> tuple[LearnerState, Metrics]:
+    return program(hyper, state, np.int32(updates))
 
 
 def xla_options(once: bool = False) -> dict[str, str | bool] | None:
