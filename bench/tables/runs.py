@@ -30,13 +30,11 @@ CURVES = ("episode_reward", "episode_cost", "violation_rate", "lambda", "episode
 TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_seen have none
 # Stored as means over seeds.
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
-HEADLINES = ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33")  # the README's
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
 WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
 TRUE = "true cost"  # also of steps that the learner did not observe
-TRUE_WORST = "true worst agent"  # of tasks whose agents have costs of their own
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
 
 

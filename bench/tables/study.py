@@ -32,19 +32,19 @@ def share(run: runs.Run) -> float:
 
 def unsafe(run: runs.Run) -> str:
     """How many seeds end beyond the limit, with the worst agent's cost where agents differ."""
-    judged = np.array(run["table"].get(runs.TRUE_WORST, run["table"][runs.TRUE]), float)
+    judged = runs.row_of(run).score("true worst agent")
     return f"{(judged > run['cost_limit'] / share(run)).sum()} of {len(judged)}"
 
 
 def pairs(files: pathlib.Path) -> list[tuple[runs.Run, runs.Run]]:
-    """MAPPO-L and F4SG wherever all else is equal: task, probability, limit of true costs, and settings.
+    """MAPPO-L and F4SG wherever all else is equal.
 
     They come by probability, then in the order of the files, whose names a + joins.
     """
     cells: dict[str, dict[str, runs.Run]] = {}
     for run in runs.load(files):
         if run["method"] in PAIR:
-            cells.setdefault(str(_cell(run)), {})[run["method"]] = run
+            cells.setdefault(_cell(run), {})[run["method"]] = run
     found = [(cell[PAIR[0]], cell[PAIR[1]]) for cell in cells.values() if len(cell) == len(PAIR)]
     return sorted(found, key=lambda pair: share(pair[0]))
 
@@ -84,9 +84,9 @@ def as_harm(files: pathlib.Path) -> str:
     return markdown([*head, "seeds beyond: MAPPO-L", "F4SG"], body)
 
 
-def _cell(run: runs.Run) -> tuple[float, float, list[tuple[str, str]]]:
-    """What F4SG and MAPPO-L have in common if they are compared: p, limit and all settings but the sample's."""
-    return share(run), _limit(run), sorted((name, x) for name, x in runs.shared(run).items() if name != "method")
+def _cell(run: runs.Run) -> str:
+    """What F4SG and MAPPO-L have in common if they are compared: the limit, and all settings but the sample's."""
+    return repr((_limit(run), {name: x for name, x in runs.shared(run).items() if name != "method"}))
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:

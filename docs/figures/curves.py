@@ -23,14 +23,14 @@ from pmt_jax.studies.run_log import Group
 from . import style
 
 DOCS = pathlib.Path(__file__).parents[1]
-FIGURES = {
-    "table1_ant_2x4": "table1_ant_2x4_h200",
-    "table1_ant_4x2": "table1_ant_4x2_h200",
-    "table2": "table2_h200",
-    "table3_voltage_33": "table3_voltage_33",
-    "velocity_half_cheetah_2x3": "velocity_h200",
-    "grid_33": "table3_voltage_33",
-    "harm": "fear_h200",
+FIGURES = {  # the picture's result, and which of its tasks
+    "table1_ant_2x4": ("table1_ant_2x4_h200", "ant_2x4"),
+    "table1_ant_4x2": ("table1_ant_4x2_h200", "ant_4x2"),
+    "table2": ("table2_h200", "hand_over_2x6"),
+    "table3_voltage_33": ("table3_voltage_33", "voltage_33"),
+    "velocity_half_cheetah_2x3": ("velocity_h200", "velocity_half_cheetah_2x3"),
+    "grid_33": ("table3_voltage_33", "voltage_33"),
+    "harm": ("fear_h200", "ant_2x4"),
 }
 PANELS = {"episode_reward": "reward of an episode", "episode_cost": "cost of an episode"}
 GRID_PANELS = {  # Fig. 3 of the paper
@@ -90,9 +90,8 @@ def _line(axis: Any, group: Group, name: str, last: int, banded: bool, pid: bool
 def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     for name in names or FIGURES:
-        found = runs.load(records.RESULTS / f"{FIGURES[name]}.json")
-        task = "ant_2x4" if name == "harm" else name
-        found = [run for run in found if run["task"] == task] or found  # a file of several tasks
+        result, task = FIGURES[name]
+        found = [run for run in runs.load(records.RESULTS / f"{result}.json") if run["task"] == task]
         panels = {"grid_33": GRID_PANELS, "harm": HARM_PANELS}.get(name, PANELS)
         draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png", panels)
         print(f"docs/{name}.png")

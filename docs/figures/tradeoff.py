@@ -19,7 +19,10 @@ from pmt_jax.studies.plot import INK, METHOD_COLOURS, cost_ticks
 from . import style
 
 DOCS = pathlib.Path(__file__).parents[1]
-FIGURES = {"tradeoff": runs.HEADLINES, "toys": ("toys",)}
+FIGURES = {
+    "tradeoff": ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33"),  # the README's
+    "toys": ("toys",),
+}
 
 
 def _by_task(files: tuple[str, ...]) -> dict[str, list[runs.Run]]:

@@ -313,7 +313,9 @@ def test_pages_show_every_result():
     marks = {name for text in pages for _, name, _, _ in render.NUMBER.findall(text)}
     shown = {file for name in blocks for file in (name.partition(":")[2] or name).split("+")}
     shown |= {file for name in marks for file in name.split(":")[1].split("+")}
-    shown |= {"ant_paths_methods", "episode_cost", "fear_map", "hand_over_catch", "hub", *curves.FIGURES.values()}
+    shown |= {"ant_paths_methods", "episode_cost", "fear_map", "hand_over_catch", "hub"} | {
+        result for result, _ in curves.FIGURES.values()
+    }
     benches = {speed.TABLES[name].result for name in shown if isinstance(speed.TABLES.get(name), speed.Table)}
     for file in records.RESULTS.glob("*.json"):
         used = file.stem in shown or any(file.stem == name or file.stem.startswith(f"{name}_") for name in benches)
