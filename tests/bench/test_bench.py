@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import importlib
 import json
 import multiprocessing
 import pathlib
@@ -15,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -25,7 +28,11 @@ from bench.__main__ import main
 from bench.cases import BENCHES, Bench, Case
 from bench.tables import pages, runs, speed, study, values
 from docs.figures import ant_paths, curves, episode_cost, style
+from pmt_jax import load_config, make_train
+from pmt_jax.config.methods import METHODS
 from pmt_jax.errors import UsageError
+from pmt_jax.learning import fear, learner
+from pmt_jax.learning.maths import advantages
 from pmt_jax.policies import hub
 from pmt_jax.studies import points, table
 from pmt_jax.studies.rows import rows
@@ -709,3 +716,41 @@ def test_the_readmes_harm_is_that_of_the_study(tmp_path: pathlib.Path):
     for cell in ("85.0 +- 7.1", "25.0 +- 7.1", "-71 %"):
         assert cell in long and cell in short
     assert short.endswith("| 2 of 2 | 0 of 2 |")
+
+
+def wrapped(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The controls, in force until the test ends."""
+    before = fear.appraise_fear, learner.gae
+    controls = importlib.import_module("bench.controls")
+    fear.appraise_fear, learner.gae = before
+    monkeypatch.setattr(fear, "appraise_fear", controls.appraise_fear)
+    monkeypatch.setattr(learner, "gae", controls.gae)
+    return controls
+
+
+def test_controls_change_what_they_say_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    """A trace of `gae_lambda` is MAPPO-Lagrangian, bit for bit; each control differs from what it controls."""
+    controls = wrapped(monkeypatch)
+
+    def trained(method: str) -> Any:
+        config = load_config("lane", method=method, num_envs=8, rollout_length=16, steps=8 * 16 * 3, log_interval=1)
+        return jax.jit(make_train(config))(jax.random.key(0))[1]
+
+    monkeypatch.setitem(METHODS, "usual_trace", dataclasses.replace(controls.trace_99, cost_trace=0.95))
+    for name in ("squared", "monte_carlo"):
+        monkeypatch.setitem(METHODS, name, getattr(controls, name))
+    found = {name: trained(name) for name in ("mappo_l", "usual_trace", "monte_carlo", "f4sg", "squared")}
+    jax.tree.map(np.testing.assert_array_equal, found["mappo_l"], found["usual_trace"])
+    assert (found["monte_carlo"]["actor/loss"] != found["mappo_l"]["actor/loss"]).any()
+    assert found["squared"]["fear/loss"][0] != found["f4sg"]["fear/loss"][0]
+    np.testing.assert_allclose(jax.grad(lambda x: controls.squared_error(x, jnp.float32(0.5)))(0.0), 0.0)
+
+
+def test_a_target_only_control_takes_advantages_from_costs_and_returns_from_fear(monkeypatch: pytest.MonkeyPatch):
+    controls, plain_gae = wrapped(monkeypatch), advantages.gae
+    felt, cost, value, after = jax.random.uniform(jax.random.key(0), (4, 5, 2, 3, 1))
+    ends = (jnp.zeros((5, 2), bool), jnp.zeros((5, 2), bool), 0.9, 0.8)
+    controls._traced.update(method=controls.target_only, cost=cost)
+    advantage, returns = controls.gae(felt, value, after, *ends)
+    np.testing.assert_array_equal(advantage, plain_gae(cost, value, after, *ends)[0])
+    np.testing.assert_array_equal(returns, plain_gae(felt, value, after, *ends)[1])
