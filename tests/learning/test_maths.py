@@ -31,6 +31,7 @@ from pmt_jax.learning.trust_region import (
     conjugate_gradient,
     constrained_direction,
     fisher,
+    in_parts,
     solve,
 )
 
@@ -396,6 +397,21 @@ def test_the_fisher_matrix_is_the_hessian_of_the_divergence():
     hessian = jax.hessian(lambda flat: divergence(*policy(flat)))(start) + DAMPING * jnp.eye(10)
     columns = jax.vmap(fisher(policy, divergence, start), out_axes=1)(jnp.eye(10))
     np.testing.assert_allclose(columns, hessian, atol=1e-5)
+
+
+def test_a_policy_in_parts_has_the_same_outputs_and_products():
+    obs, weights, step = (jax.random.normal(jax.random.key(i), shape) for i, shape in enumerate([(20, 3), (8,), (8,)]))
+
+    def policy(flat: jax.Array, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.tanh(obs @ flat[:6].reshape(3, 2)), jnp.exp(flat[6:])
+
+    whole, cut = (jax.linearize(in_parts(policy, obs, parts), weights) for parts in (1, 4))
+    for ours, theirs in zip(cut[0], whole[0], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    for ours, theirs in zip(cut[1](step), whole[1](step), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+    pulled = [jax.linear_transpose(push, weights)(whole[1](step))[0] for _, push in (whole, cut)]
+    np.testing.assert_allclose(pulled[1], pulled[0], rtol=1e-5, atol=1e-5)
 
 
 def exact(g: np.ndarray, b: np.ndarray, c: float, h: np.ndarray, delta: float) -> np.ndarray | None:
