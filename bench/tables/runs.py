@@ -197,6 +197,30 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
     return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
 
 
+def as_printed(file: pathlib.Path) -> str:
+    """Methods by tasks, of what a command of ours printed: reward with its interval / cost, and seeds within.
+
+    Above it the runs of the command, and how long they took together.
+    """
+    report = json.loads(file.read_text())
+    printed = report["rows"]
+    tasks, methods = (list(dict.fromkeys(row[name] for row in printed)) for name in ("task", "method"))
+    limits = {row["task"]: row["limit"] for row in printed}
+    words = {}
+    for row in printed:
+        reward, low, high = row["reward"]
+        seeds = f"{row['within']} of {row['seeds']}"
+        words[row["task"], row["method"]] = f"{reward:,.0f} [{low:,.0f}, {high:,.0f}] / {row['cost'][0]:.3g}, {seeds}"
+    count, steps = sum(row["seeds"] for row in printed), round(printed[0]["steps"] / 1e6)
+    devices = f"{report['devices']} x {report['device']}"
+    took = (
+        f"{count} runs of {steps} M steps in {report['seconds'] / 60:.1f} minutes on {devices}, all compiling included"
+    )
+    head = ["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)]
+    body = [[f"`{method}`", *(words.get((task, method), "-") for task in tasks)] for method in methods]
+    return f"`{report['command']}`, {took}:\n\n{markdown(head, body)}"
+
+
 @functools.cache  # each run is compared with each
 def _settings(config: str) -> dict[str, Any]:
     return tomllib.loads(config)
@@ -248,7 +272,8 @@ def _mean_std(*mean_and_std: float | None) -> str:
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     """Whether a run's multiplier follows PID; the setting is there for methods without one, too."""
-    return METHODS[method].constraint == "lagrangian" and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
+    lagrangian = method in METHODS and METHODS[method].constraint == "lagrangian"
+    return lagrangian and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
 
 
 def row_of(run: Run) -> TableRow:
@@ -310,5 +335,6 @@ KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "paper": as_paper,
     "summary": as_summary,
     "overview": as_overview,
+    "printed": as_printed,
     "ran": as_ran,
 }

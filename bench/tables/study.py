@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import pathlib
 from collections.abc import Callable
 
@@ -17,6 +18,15 @@ Scores = NDArray[np.float64]  # [seeds]
 
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 PAIR = ("mappo_l", "f4sg")
+CONTROLLED = "ant_2x4"
+CONTROLS = {  # labels of stored runs, in the order of the table
+    "mappo_l": "MAPPO-L",
+    "f4sg": "F4SG",
+    "current": "F4SG with fear of the current state",
+    "squared": "F4SG with squared errors",
+    "target_only": "fear as target of the cost critic alone",
+    "r4sg": "R4SG",
+}
 
 
 def measures(run: runs.Run) -> dict[str, Scores]:
@@ -76,12 +86,51 @@ def as_harm(files: pathlib.Path) -> str:
     found = pairs(files)
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
+    often = collections.Counter((pair[0]["task"], share(pair[0])) for pair in found)
     body = []
     for pair, (theirs, ours), corrected in zip(found, scores, p, strict=True):
-        line = [f"`{pair[0]['task']}`", f"{share(pair[0]):g}", mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
+        task = f"`{pair[0]['task']}`" + f", limit {_limit(pair[0]):g}" * (often[pair[0]["task"], share(pair[0])] > 1)
+        line = [task, f"{share(pair[0]):g}", mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
         body.append([*line, p_value(corrected), *map(unsafe, pair)])
     head = ["task", "p", "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p"]
     return markdown([*head, "seeds beyond: MAPPO-L", "F4SG"], body)
+
+
+def as_controls(files: pathlib.Path) -> str:
+    """What lacks a part of F4SG, or has one, against F4SG and against MAPPO-L: `ant_2x4`, until all have ended.
+
+    Holm corrects all tests of the table together. Files are joined by +.
+    """
+    found = {run.get("label", run["method"]): run for run in runs.load(files) if run["task"] == CONTROLLED}
+    end = min(run["steps"][-1] for run in found.values())
+    scores = {name: _until(run, end) for name, run in found.items()}
+    tested = [(name, other) for name in CONTROLS for other in PAIR if name not in (other, PAIR[0])]
+    p = holm([welch_test(scores[name]["training"], scores[other]["training"]) for name, other in tested])
+    corrected = dict(zip(tested, p, strict=True))
+    body = []
+    for name, words in CONTROLS.items():
+        own, limit = scores[name], _limit(found[name])
+        line = [words, mean_sd(own["training"])]
+        for other in reversed(PAIR):
+            p = corrected.get((name, other))
+            difference = _difference(own["training"], scores[other]["training"])
+            line.append("-" if p is None else f"{difference}, {p_value(p)}")
+        line += [mean_sd(own["end"]), mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {own['end'].size}"]
+        body.append(line)
+    against = [f"less {NAMES[other]}'s [95 %], d, p" for other in reversed(PAIR)]
+    return markdown(["", "harm, of 1,000 steps", *against, "true cost at the end", "reward", "seeds beyond"], body)
+
+
+def _until(run: runs.Run, end: int) -> dict[str, Scores]:
+    """The measures as if the run had ended at step `end`: harm until then, cost and reward of the last tenth."""
+    steps = np.array(run["steps"])
+    until, last = steps <= end, (steps <= end) & (steps > 0.9 * end)
+    curves = {name: np.array(run[name], float) for name in ("true_step_cost", "true_episode_cost", "episode_reward")}
+    return {
+        "training": 1000 * np.nanmean(curves["true_step_cost"][:, until], 1),
+        "end": np.nanmean(curves["true_episode_cost"][:, last], 1),
+        "reward": np.nanmean(curves["episode_reward"][:, last], 1),
+    }
 
 
 def _cell(run: runs.Run) -> str:
@@ -90,12 +139,17 @@ def _cell(run: runs.Run) -> str:
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:
-    """The difference of the means with its 95 % interval, in standard deviations, and as a share of theirs."""
+    """As `_difference`, and as a share of theirs."""
+    return f"{_difference(ours, theirs)}, {_change(ours, theirs)}"
+
+
+def _difference(ours: Scores, theirs: Scores) -> str:
+    """The difference of the means with its 95 % interval, and in standard deviations."""
     low, high = difference_interval(ours, theirs)
     difference = ours.mean() - theirs.mean()
     spread = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 2)
     in_sd = difference / spread if spread else 0
-    return f"{difference:.1f} [{low:.1f}, {high:.1f}], {in_sd:.1f}, {_change(ours, theirs)}"
+    return f"{difference:.1f} [{low:.1f}, {high:.1f}], {in_sd:.1f}"
 
 
 def _change(ours: Scores, theirs: Scores) -> str:
@@ -138,4 +192,9 @@ def p_value(value: float) -> str:
     return "< .001" if value < 0.001 else f"{value:.3f}".lstrip("0") if value < 1 else "1"
 
 
-KINDS: dict[str, Callable[[pathlib.Path], str]] = {"weights": as_weights, "probe": as_probe, "harm": as_harm}
+KINDS: dict[str, Callable[[pathlib.Path], str]] = {
+    "weights": as_weights,
+    "probe": as_probe,
+    "harm": as_harm,
+    "controls": as_controls,
+}

@@ -20,7 +20,7 @@ from . import style
 
 DOCS = pathlib.Path(__file__).parents[1]
 FIGURES = {
-    "tradeoff": ("table1_ant_2x4_h200", "table1_ant_4x2_h200", "table2_h200", "table3_voltage_33"),  # the README's
+    "tradeoff": ("table1_ant_2x4_h200", "recipe_ant_4x2_h200", "table2_h200", "table3_voltage_33"),  # the README's
     "toys": ("toys",),
 }
 

@@ -644,6 +644,9 @@ def test_a_gradient_step_is_timed_by_part():
 # The study's tables
 
 
+CURVED = ("steps", "true_step_cost", "true_episode_cost", "episode_reward", "episode_cost", "violation_rate", "lambda")
+
+
 def run_of_three_seeds(method: str, seen: float, true_cost: list[float], **settings: float) -> dict:
     """A run of three seeds and ten points whose true episode cost is constant."""
     points, seeds = 10, len(true_cost)
@@ -716,6 +719,33 @@ def test_the_readmes_harm_is_that_of_the_study(tmp_path: pathlib.Path):
     for cell in ("85.0 +- 7.1", "25.0 +- 7.1", "-71 %"):
         assert cell in long and cell in short
     assert short.endswith("| 2 of 2 | 0 of 2 |")
+
+
+def test_controls_are_compared_where_all_have_run(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    """Up to the end of the shortest run; a line each, against F4SG and against MAPPO-L."""
+    monkeypatch.setattr(study, "CONTROLLED", "lane")
+    stored = []
+    for cost, name in enumerate(study.CONTROLS, 1):
+        run = run_of_three_seeds("f4sg" if name == "current" else name, 0.5, [2.0 * cost, 3.0 * cost, 4.0 * cost])
+        run |= {"label": name, "true_step_cost": [[*x[:5], *[9.0] * 5] for x in run["true_step_cost"]]}
+        stored.append(run)
+    short = stored[-1]
+    short |= {name: x[:5] if name == "steps" else [y[:5] for y in x] for name, x in short.items() if name in CURVED}
+    (tmp_path / "x.json").write_text(json.dumps(stored))
+    lines = [line.split(" | ") for line in study.as_controls(tmp_path / "x.json").splitlines()[2:]]
+    assert [line[1] for line in lines[:2]] == ["30.0 +- 10.0", "60.0 +- 20.0"]  # what is after the fifth point is not
+    assert lines[0][2:4] == ["-", "-"] and lines[1][2] == "-" and lines[1][3].startswith("30.0 [")
+    assert [line[-1].rstrip(" |") for line in lines] == [f"{x} of 3" for x in (0, 2, 3, 3, 3, 3)]
+
+
+def test_a_printed_table_is_shown_with_what_made_it(tmp_path: pathlib.Path):
+    row = {"task": "lane", "method": "mappo", "seeds": 20, "steps": 10_004_480, "limit": 10.0}
+    row |= {"reward": [1234.4, 1200.0, 1300.0], "cost": [2.345, 2.0, 3.0], "within": 19}
+    made = {"command": "pmt x", "device": "GPU", "devices": 2, "seconds": 90, "rows": [row]}
+    (tmp_path / "x.json").write_text(json.dumps(made))
+    title, _, head, _, line = runs.as_printed(tmp_path / "x.json").splitlines()
+    assert title.startswith("`pmt x`, 20 runs of 10 M steps in 1.5 minutes on 2 x GPU")
+    assert "`lane` (limit 10)" in head and line == "| `mappo` | 1,234 [1,200, 1,300] / 2.35, 19 of 20 |"
 
 
 def wrapped(monkeypatch: pytest.MonkeyPatch) -> Any:
