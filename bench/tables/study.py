@@ -18,6 +18,7 @@ Scores = NDArray[np.float64]  # [seeds]
 
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 PAIR = ("mappo_l", "f4sg")
+EQUAL = {"reward": 2, "training": 10}  # bounds of equivalence, %
 CONTROLLED = "ant_2x4"
 CONTROLS = {  # labels of stored runs, in the order of the table
     "mappo_l": "MAPPO-L",
@@ -46,16 +47,16 @@ def unsafe(run: runs.Run) -> str:
     return f"{(judged > run['cost_limit'] / share(run)).sum()} of {len(judged)}"
 
 
-def pairs(files: pathlib.Path) -> list[tuple[runs.Run, runs.Run]]:
-    """MAPPO-L and F4SG wherever all else is equal.
+def pairs(files: pathlib.Path, pair: tuple[str, str] = PAIR) -> list[tuple[runs.Run, runs.Run]]:
+    """MAPPO-L and F4SG, or another pair of methods, wherever all else is equal.
 
     They come by probability, then in the order of the files, whose names a + joins.
     """
     cells: dict[str, dict[str, runs.Run]] = {}
     for run in runs.load(files):
-        if run["method"] in PAIR:
+        if run["method"] in pair:
             cells.setdefault(_cell(run), {})[run["method"]] = run
-    found = [(cell[PAIR[0]], cell[PAIR[1]]) for cell in cells.values() if len(cell) == len(PAIR)]
+    found = [(cell[pair[0]], cell[pair[1]]) for cell in cells.values() if len(cell) == len(pair)]
     return sorted(found, key=lambda pair: share(pair[0]))
 
 
@@ -119,6 +120,27 @@ def as_controls(files: pathlib.Path) -> str:
         body.append(line)
     against = [f"less {NAMES[other]}'s [95 %], d, p" for other in reversed(PAIR)]
     return markdown(["", "harm, of 1,000 steps", *against, "true cost at the end", "reward", "seeds beyond"], body)
+
+
+def as_equivalence(files: pathlib.Path) -> str:
+    """R4SG less MAPPO-L in shares of MAPPO-L's mean, a line a comparison, and whether they are equal within `EQUAL`.
+
+    Two one-sided tests of Welch at 5 % say that they are where the 90 % interval lies within the bounds.
+    """
+    body = []
+    for theirs, ours in pairs(files, ("mappo_l", "r4sg")):
+        line = [f"`{ours['task']}`", f"{share(ours):g}", str(len(ours["seeds"]))]
+        for name, bound in EQUAL.items():
+            found, reference = measures(ours)[name], measures(theirs)[name]
+            scale = 100 / abs(reference.mean())
+            low, high = (scale * x for x in difference_interval(found, reference, 0.9))
+            words = "yes" if max(-low, high) < bound else "not shown"
+            line += [f"{scale * (found.mean() - reference.mean()):.1f} [{low:.1f}, {high:.1f}]", words]
+        body.append(line)
+    head = ["task", "p", "seeds"]
+    for what, bound in zip(("reward", "harm"), EQUAL.values(), strict=True):
+        head += [f"{what}, % [90 %]", f"equal within {bound} %"]
+    return markdown(head, body)
 
 
 def _until(run: runs.Run, end: int) -> dict[str, Scores]:
@@ -197,4 +219,5 @@ KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "probe": as_probe,
     "harm": as_harm,
     "controls": as_controls,
+    "equivalence": as_equivalence,
 }

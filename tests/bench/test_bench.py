@@ -738,6 +738,15 @@ def test_controls_are_compared_where_all_have_run(tmp_path: pathlib.Path, monkey
     assert [line[-1].rstrip(" |") for line in lines] == [f"{x} of 3" for x in (0, 2, 3, 3, 3, 3)]
 
 
+def test_equivalence_is_what_an_interval_within_the_bounds_shows(tmp_path: pathlib.Path):
+    """The mean's interval at 90 % is within 10 % of 100 +- 1, and is not of 100 +- 20; constant rewards are equal."""
+    for costs, words in (([9.9, 10.0, 10.1], "yes"), ([8.0, 10.0, 12.0], "not shown")):
+        cells = [run_of_three_seeds(method, 0.5, costs) for method in ("mappo_l", "r4sg")]
+        (tmp_path / "x.json").write_text(json.dumps(cells))
+        line = study.as_equivalence(tmp_path / "x.json").splitlines()[2]
+        assert line.startswith("| `lane` | 0.5 | 3 | 0.0 [0.0, 0.0] | yes | 0.0 [") and line.endswith(f"] | {words} |")
+
+
 def test_a_printed_table_is_shown_with_what_made_it(tmp_path: pathlib.Path):
     row = {"task": "lane", "method": "mappo", "seeds": 20, "steps": 10_004_480, "limit": 10.0}
     row |= {"reward": [1234.4, 1200.0, 1300.0], "cost": [2.345, 2.0, 3.0], "within": 19}
