@@ -137,6 +137,7 @@ def _scaled(task: str, num_envs: int, length: int, devices: Sequence[int]) -> tu
 
 # The ant's batch and networks, also on a task whose environment costs next to nothing: there the learner is alone.
 _BATCH = (("epochs", 5), ("minibatches", 8), ("hidden", (128, 128)))
+_GRU = ("recurrent", "gru")
 _LIKE_THE_ANT = (*_BATCH, ("activation", "relu"), ("layer_norm", True))
 _TOOLS = ("power-grid-model iterative_current", "power-grid-model newton_raphson")
 _SINGLE_TOOLS = ("lightsim2grid", "lightsim2grid, solve only", "pandapower")
@@ -239,7 +240,9 @@ BENCHES = {
         "every method: seconds to compile and per update, steps/s of the whole training loop",
         (
             *(_training("ant_2x4", method, 1, 64, 64, *_BATCH) for method in METHODS),
+            _training("ant_2x4", "mappo_l", 1, 64, 64, *_BATCH, _GRU, what="gru"),
             *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
+            _training("switch", "mappo_l", 1, 64, 64, *_LIKE_THE_ANT, _GRU, what="gru"),
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
     ),

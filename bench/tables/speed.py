@@ -190,7 +190,7 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "": _contestant,
     "task": _shown("{}", "task"),
     "what": _shown("{}", "what"),
-    "method": _shown("{}", "method"),
+    "method": lambda row, rows: f"{row['method']} {row.get('what', '')}".strip(),
     "scaling": _shown("{}", "what"),
     "engine": _engine,
     "batch": lambda row, rows: f"{row.get('num_envs', 1):,}",
