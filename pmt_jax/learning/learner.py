@@ -69,12 +69,13 @@ def train_some(
     Returns:
       the state, and metrics with a leading [most]; those from `updates` on are 0.
     """
-    _, like = jax.eval_shape(partial(train_step, setup, hyper), state)
+    update = jax.jit(partial(train_step, setup), inline=True)  # traced once, for the shapes and for the loop
+    _, like = jax.eval_shape(update, hyper, state)
     nothing = jax.tree.map(lambda x: jnp.zeros((most, *x.shape), x.dtype), like)
 
     def step(i: jax.Array, carry: tuple[LearnerState, Metrics]) -> tuple[LearnerState, Metrics]:
         state, seen = carry
-        state, metrics = train_step(setup, hyper, state)
+        state, metrics = update(hyper, state)
         return state, jax.tree.map(lambda x, new: x.at[i].set(new), seen, metrics)
 
     return jax.lax.fori_loop(0, updates, step, (state, nothing))
