@@ -54,43 +54,45 @@ def train(count, task, **sizes):
     return program, {**checkpoint.pack(state), **{k: np.asarray(x) for k, x in metrics.items()}}
 
 task, sizes = sys.argv[1], json.loads(sys.argv[2])
-if sizes.pop("share_rows"):  # as on GPUs
-    sharding.takes_whole_parts = lambda: False
+sharing, whole_parts = sizes.pop("sharing"), sharding.takes_whole_parts
 if sizes.get("physics") == "warp":  # steps on a CPU too, so slowly that nobody is offered it
     from envs.physics import contract
     contract.obstacle = lambda name: None
-program, split = train(4, task, **sizes)
 whole = train(1, task, **sizes)[1] if sizes["seeds"] < 4 else {}
-apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))
-         for path, x in whole.items() if x.dtype != bool and np.isfinite(x).all() and path != "actor/case"}
 collective = r" = [^=]*? (?:all-gather|all-reduce|all-to-all|collective-permute)(?:-start)?\(.*"
-print(json.dumps({
-    "leaves": len(apart),
-    "furthest": max((x, path) for path, x in apart.items()) if apart else None,
-    "collectives": re.findall(collective, program),
-    "with_host_calls": [re.findall(collective, part) for part in program.split("\n\n") if "pmt_host_call" in part],
-    "host_calls": re.findall(r" = (f32\[[\d,]+\])[^=]*custom-call.*pmt_host_call", program),
-}))
+for share_rows in sharing:
+    sharding.takes_whole_parts = (lambda: False) if share_rows else whole_parts
+    program, split = train(4, task, **sizes)
+    apart = {path: float(np.max(np.abs(x.astype(float) - split[path]) / (1 + np.abs(x))))
+             for path, x in whole.items() if x.dtype != bool and np.isfinite(x).all() and path != "actor/case"}
+    print(json.dumps({
+        "leaves": len(apart),
+        "furthest": max((x, path) for path, x in apart.items()) if apart else None,
+        "collectives": re.findall(collective, program),
+        "with_host_calls": [re.findall(collective, part) for part in program.split("\n\n") if "pmt_host_call" in part],
+        "host_calls": re.findall(r" = (f32\[[\d,]+\])[^=]*custom-call.*pmt_host_call", program),
+    }))
 """
 
 
-def compare(task: str, share_rows: bool = False, **sizes: object) -> dict:
+def compare(task: str, *sharing: bool, **sizes: object) -> list[dict]:
     """A chunk of training on four devices: its program, and how far its end is from that on one (but for 4 seeds).
 
-    The devices of a CPU take whole networks, but if they `share_rows`, as GPUs do.
+    Args:
+      sharing: for each result whether devices share rows, as GPUs do. Those of a CPU take whole networks.
 
     Which case a trust region's step came from is not compared: where two cases meet, rounding decides.
     """
-    command = [sys.executable, "-c", COMPARE, task, json.dumps({**sizes, "share_rows": share_rows})]
+    command = [sys.executable, "-c", COMPARE, task, json.dumps({**sizes, "sharing": sharing})]
     done = subprocess.run(command, env=environment(XLA_FLAGS=FOUR), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return [json.loads(line) for line in done.stdout.splitlines()[-len(sharing) :]]
 
 
 @pytest.mark.full
 def test_seeds_and_environments_split_change_nothing_but_rounding():
     """The corridor ant under the method with the most networks; the C engine steps each device's own environments."""
-    found = compare("ant_2x4", share_rows=True, physics="mujoco", method="mixed", seeds=2, num_envs=8)
+    (found,) = compare("ant_2x4", True, physics="mujoco", method="mixed", seeds=2, num_envs=8)
     assert found["leaves"] > 100 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["host_calls"] == ["f32[1,4,134]"]  # one seed of two, four environments of eight
     assert found["with_host_calls"] == [[]]  # nothing is sent in the scan of control steps
@@ -105,22 +107,24 @@ def test_waiting_devices_leave_threads_to_the_others(devices: int):
 @pytest.mark.full
 def test_warp_steps_each_devices_own_environments():
     pytest.importorskip("warp")
-    found = compare("ant_2x4", method="mappo_l", seeds=2, num_envs=8, physics="warp")
+    (found,) = compare("ant_2x4", False, method="mappo_l", seeds=2, num_envs=8, physics="warp")
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
 
 
 @pytest.mark.full
 def test_environments_split_under_a_trust_region():
-    found = compare("lane", share_rows=True, method="macpo", seeds=1, num_envs=4, **ACCEPTED)
-    assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
-    assert in_fits(found["collectives"])
+    """Where devices share rows, and where each fits whole networks, as those of a CPU do."""
+    found = compare("lane", True, False, method="macpo", seeds=1, num_envs=4, **ACCEPTED)
+    for each in found:
+        assert each["leaves"] > 50 and each["furthest"][0] < 2e-4, each["furthest"]
+    shared, whole = (each["collectives"] for each in found)
+    assert in_fits(shared) and whole and not in_fits(whole)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("method", "sizes"), [("macpo", {"seeds": 1, **ACCEPTED}), ("mixed", {"seeds": 2})])
-def test_devices_of_a_cpu_fit_whole_networks(method: str, sizes: dict[str, float]):
+def test_devices_of_a_cpu_fit_whole_networks():
     """Below, two devices and two processes fit one actor of all agents."""
-    found = compare("lane", method=method, num_envs=4, **sizes)
+    (found,) = compare("lane", False, method="mixed", num_envs=4, seeds=2)
     assert found["leaves"] > 50 and found["furthest"][0] < 2e-4, found["furthest"]
     assert found["collectives"] and not in_fits(found["collectives"])
 
@@ -133,7 +137,7 @@ def in_fits(collectives: list[str]) -> list[str]:
 
 @pytest.mark.full
 def test_seeds_do_not_wait_for_each_other():
-    found = compare("lane", method="happo", seeds=4, num_envs=3)
+    (found,) = compare("lane", False, method="happo", seeds=4, num_envs=3)
     figures = [line for line in found["collectives"] if "while" not in line]  # gathered after the scan of updates
     assert figures and figures == found["collectives"]
 
