@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Order = Literal["simultaneous", "sequential"]
 Kind = Literal["none", "lagrangian", "trust_region", "pid", "switching", "penalty"]
 Weight = Literal["none", "regret"]
+Surrogate = Literal["clipped", "first_order"]
+Seen = Literal["state", "observation"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +56,8 @@ class Method:
     cost_signal: Literal["cost", "fear"] | Callable[[Any], jax.Array] = "cost"
     ratio_weight: Weight = "none"
     share_actor: bool = False
-    surrogate: Literal["clipped", "first_order"] = "clipped"
-    critic: Literal["state", "observation"] = "state"
+    surrogate: Surrogate = "clipped"
+    critic: Seen = "state"
     letter: bool = False
 
     def __post_init__(self) -> None:
@@ -64,10 +66,14 @@ class Method:
         Raises:
           UsageError: the first such switch.
         """
-        for name, kind in {"order": Order, "constraint": Kind, "ratio_weight": Weight}.items():
+        kinds = {"order": Order, "constraint": Kind, "ratio_weight": Weight, "surrogate": Surrogate, "critic": Seen}
+        for name, kind in kinds.items():
             words = typing.get_args(kind)
             if getattr(self, name) not in words:
                 raise UsageError(f"a method's {name} must be {' or '.join(words)}, not {getattr(self, name)!r}")
+        for name in ("share_actor", "letter"):
+            if not isinstance(getattr(self, name), bool):
+                raise UsageError(f"a method's {name} must be True or False, not {getattr(self, name)!r}")
         if self.cost_signal not in ("cost", "fear") and not callable(self.cost_signal):
             raise UsageError(f"a method's cost_signal must be cost, fear or a function, not {self.cost_signal!r}")
         if self.letter and (self.order, self.constraint, self.surrogate) != ("sequential", "lagrangian", "clipped"):

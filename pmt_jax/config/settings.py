@@ -203,8 +203,14 @@ class Config(Hyper):
         return -(-self.steps // self.batch_size)
 
     def replace(self, **changes: Any) -> Config:
-        """A copy with some fields changed, checked like a new one."""
-        return dataclasses.replace(self, **changes)
+        """A copy with some fields changed, which are read as keywords of `load_config` are.
+
+        Raises:
+          UsageError: an unknown field, or a value that does not fit.
+        """
+        from .load import convert  # which needs this module
+
+        return dataclasses.replace(self, **{name: convert(name, value) for name, value in changes.items()})
 
 
 FIELDS: dict[str, Any] = typing.get_type_hints(Config)

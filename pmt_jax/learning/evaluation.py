@@ -13,6 +13,7 @@ import numpy as np
 import scipy.special
 
 from .. import limits, tasks
+from ..errors import UsageError
 from . import sharding
 from .rollout import ObserveCost, cost_beyond
 from .setup import Setup
@@ -38,7 +39,7 @@ def evaluate(
     hyper: Hyper | None = None,
     record: bool = False,
 ) -> Metrics:
-    """Runs one seed's policy for `episodes` whole episodes.
+    """Runs one seed's policy for `episodes` whole episodes; vmap it over the states of several seeds.
 
     Args:
       setup: the run's task and networks.
@@ -52,7 +53,16 @@ def evaluate(
     Returns:
       The metrics of `play`, and within_limit [episodes]: whether each cost of each agent (the true one, of several each
       observed one) is within its limit.
+
+    Raises:
+      UsageError: `episodes` is below 1, or `state` is of several seeds.
     """
+    if episodes < 1:
+        raise UsageError(f"evaluate takes at least 1 episode, not {episodes}")
+    if jnp.ndim(state.obs_moments.weight):
+        raise UsageError(
+            "evaluate takes the state of one seed; for several: jax.vmap(lambda s: evaluate(setup, s, ...))"
+        )
     hyper = setup.hyper if hyper is None else hyper
     key = jax.random.key(FRESH_KEY if fresh else EVALUATION_KEY)
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
+import traceback
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
+from ..errors import UsageError
 from .maths.losses import appraisal_loss, cross_entropy
 from .optimise import fit
 from .rollout import flatten_steps
@@ -36,7 +40,7 @@ def appraise_fear(
     """
     if net is None:
         signal = setup.method.cost_signal
-        return None, signal(batch) if callable(signal) else batch.cost, {}
+        return None, own_signal(signal, batch) if callable(signal) else batch.cost, {}
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
     share = batch.cost / jnp.where(largest > 0, largest, 1.0)
     net = dataclasses.replace(net, params=setup.nets.set_fear_to_cost_rate(net.params, share.mean((0, 1))))
@@ -54,6 +58,25 @@ def appraise_fear(
     net, metrics = fit(net, loss, samples, key, **limits, **passes)
     fear = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     return net, largest * fear, {**metrics, **calibration(remembered, share)}
+
+
+def own_signal(signal: Callable[[Batch], jax.Array], batch: Batch) -> jax.Array:
+    """What a method's own function makes of a batch: [T, B, N, K].
+
+    Raises:
+      UsageError: it fails, or returns something else.
+    """
+    name = f"the method's cost_signal {getattr(signal, '__name__', '')}".strip()
+    try:
+        found = jnp.asarray(signal(batch))
+    except Exception as error:  # a user's function may raise anything
+        *_, last = traceback.extract_tb(error.__traceback__)[:2]  # this function, then the user's
+        first = (str(error).splitlines() or [""])[0]
+        place = f"{pathlib.Path(last.filename).name}, line {last.lineno}"
+        raise UsageError(f"{name} fails: {type(error).__name__}: {first} ({place})") from error
+    if found.shape != batch.cost.shape:
+        raise UsageError(f"{name} must return an array [T, B, N, K], here {batch.cost.shape}, not {found.shape}")
+    return found
 
 
 def calibration(probability: jax.Array, outcome: jax.Array) -> Metrics:

@@ -14,6 +14,7 @@ set.lambda_lr = "log:0.01:1"
 
 from __future__ import annotations
 
+import collections
 import itertools
 import math
 import pathlib
@@ -136,6 +137,10 @@ def _check(part: Part, fixed: Mapping[str, Any]) -> None:
             raise UsageError(f"unknown setting '{name}'{did_you_mean(name, FIELDS)}")
         if name in part.values and not part.values[name]:
             raise UsageError(f"{name} varies over an empty list; give it at least one value")
+        words = [_word(x) for x in part.values.get(name, ())]
+        if twice := [word for word, count in collections.Counter(words).items() if count > 1]:
+            lists = f"; one list of them goes into brackets: {name}=[{','.join(words)}]" if name == "hidden" else ""
+            raise UsageError(f"{name} has the value {twice[0]} twice; name each once{lists}")
         if name == "task":
             raise UsageError("--set has one task; sweep each with its own --out, or give each a [[sweep]] in a file")
     for name in part.ranges:

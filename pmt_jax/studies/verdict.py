@@ -28,17 +28,19 @@ def lines(folder: pathlib.Path) -> list[str]:
         said.append(_advice(log, beyond))
     if beyond and by_mean is not None and not (by_mean > 0).any() and np.isfinite(by_mean).all():
         said.append("what is deployed acts without noise and keeps the limit")
-    elif not beyond and by_mean is not None and (by_mean > 0).any():
+    elif (by_training <= 0).all() and by_mean is not None and (by_mean > 0).any():
         said.append("mean actions are beyond it where sampled ones are not: raise --cost-margin, or deploy with noise")
     return said
 
 
 def _kept(log: RunLog, by_training: np.ndarray, by_mean: np.ndarray | None) -> str:
     source = "evaluations" if log.evaluated else "training episodes, with noise"
-    parts = [_count(by_training, f"in the last tenth of the steps ({source})")]
+    where = f"in the last tenth of the steps ({source})"
+    unknown = not log.broken and np.isnan(by_training).all()
+    parts = [f"unknown {where}, as no episode ended" if unknown else f"kept {_count(by_training, where)}"]
     if by_mean is not None:
-        parts.append(_count(by_mean, "under mean actions"))
-    return f"limit {log.limits}: kept {'; '.join(parts)}"
+        parts.append(("kept " if unknown else "") + _count(by_mean, "under mean actions"))
+    return f"limit {log.limits}: {'; '.join(parts)}"
 
 
 def _count(excess: np.ndarray, where: str) -> str:

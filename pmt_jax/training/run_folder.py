@@ -123,6 +123,12 @@ class RunFolder:
             edited = saved.provenance.unexplained(saved.step, written, self._changes)
             self._run = Provenance(saved.provenance.config if edited else written, saved.provenance.trials)
         check_settings(self.path, self._run, self._provenance, edited, change, self._say)
+        asked = self._setup.config.num_updates * self._setup.config.batch_size
+        if saved and saved.step > asked:
+            raise UsageError(
+                f"the run in {self.path} has {saved.step:,} steps already, more than the {asked:,} asked for; --steps "
+                f"may only grow: ask for {saved.step} or more, or leave it out"
+            )
         self._is_edited = bool(edited)
         check_machine(self.path, self._setup.config.physics, versions(self._setup), self._say)
         return saved

@@ -111,6 +111,17 @@ def test_somebody_elses_method_is_executed_only_if_trusted(
             ":doubled",
             "cost_signal must be cost, fear or a func",
         ),
+        (
+            FILE.replace("cost_signal=harm", 'surrogate="cliped"'),
+            ":doubled",
+            "surrogate must be clipped or first_order",
+        ),
+        (FILE.replace("cost_signal=harm", 'critic="states"'), ":doubled", "critic must be state or observation"),
+        (
+            FILE.replace("cost_signal=harm", 'share_actor="no"'),
+            ":doubled",
+            "share_actor must be True or False, not 'no'",
+        ),
         (None, ":x", "there is no file"),
     ],
 )
@@ -121,6 +132,20 @@ def test_mistakes_are_one_sentence(
     code, _, err = cli("train", "lane", "--method", f"{file}{name}", *TINY, "--out", tmp_path / "run")
     assert code == 2 and said in err and len(err.splitlines()) == 1, err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("batch.costs", "cost_signal harm fails: AttributeError: 'Batch' object has no attribute 'costs'"),
+        ("batch.cost[..., 0]", "must return an array [T, B, N, K], here (25, 4, 2, 1), not (25, 4, 2)"),
+    ],
+)
+def test_a_signal_that_fails_is_one_sentence(returned: str, said: str, file: pathlib.Path, tmp_path: pathlib.Path, cli):
+    file.write_text(FILE.replace("2 * batch.cost", returned))
+    code, _, err = cli("train", "lane", "--method", f"{file}:doubled", *TINY, "--out", tmp_path / "run")
+    assert code == 2 and said in err and "Traceback" not in err, err
+    assert "(mine.py, line 6)" in err or "must return" in err
 
 
 def test_unknown_words_are_still_refused():

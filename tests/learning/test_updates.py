@@ -18,6 +18,7 @@ from pmt_jax import METHODS, load_config, make_setup, make_train
 from pmt_jax.config.settings import Hyper
 from pmt_jax.errors import UsageError
 from pmt_jax.learning import constraint, critics, learner, rollout, schedules
+from pmt_jax.learning.evaluation import evaluate
 from pmt_jax.learning.maths import running_moments
 from pmt_jax.learning.setup import Setup
 from pmt_jax.learning.types import Batch, Critic, LearnerState
@@ -427,3 +428,12 @@ def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float
     """Its limit is 1, where 18.85 can be earned; costs are held to 0.8. The figures are of 8 seeds."""
     cost, reward = learned("lane", method)
     assert cost <= most_cost and reward >= least_reward
+
+
+def test_an_evaluation_of_nothing_and_of_several_seeds_is_refused():
+    setup = make_setup(load_config("lane", num_envs=4, hidden=[8]))
+    states = jax.vmap(functools.partial(learner.init, setup, setup.hyper))(jax.random.split(jax.random.key(0), 2))
+    with pytest.raises(UsageError, match="at least 1 episode, not 0"):
+        evaluate(setup, jax.tree.map(lambda x: x[0], states), 0, deterministic=True)
+    with pytest.raises(UsageError, match="one seed; for several: jax.vmap"):
+        evaluate(setup, states, 2, deterministic=True)

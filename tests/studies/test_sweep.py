@@ -265,6 +265,11 @@ def test_reproduce_a_whole_table_at_the_smoke_budget(tmp_path: pathlib.Path, cli
         (["--set", "clip=0.1,wide"], "clip = 'wide' does not fit: expected a number"),
         (["--set", "method=happo,hapo"], "unknown method 'hapo'; did you mean 'happo'?"),
         (["--set", "task=lane,noisy"], "--set has one task"),
+        (["--set", "clip=0.1,0.10"], "clip has the value 0.1 twice; name each once"),
+        (
+            ["--set", "hidden=64,64"],
+            "hidden has the value 64 twice; name each once; one list of them goes into brackets",
+        ),
         ([], "nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table"),
         (["--set", "clip=0.1:0.2"], "clip has a range: add --random N, the number of values to draw"),
         (["--set", "clip=0.1,0.2", "--random", "3"], "random draws need a range"),

@@ -128,6 +128,11 @@ CASES = {
     "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
     "trust region": (log_of([FLAT + 4], method="macpo"), "0 of 1", "raise --limit-lr"),
     "by its noise": (log_of([FLAT], deployed=[0.2]), "; by 1 of 1 seed under mean actions", "keeps the limit"),
+    "no episode": (
+        log_of([FLAT * np.nan], deployed=[3.0]),
+        "limit 1: unknown in",
+        "no episode ended; kept by 0 of 1 seed",
+    ),
     "only with noise": (log_of([FLAT - 1], deployed=[3.0]), "under mean actions, the worst 2 beyond", "with noise"),
 }
 

@@ -251,6 +251,12 @@ def test_a_run_goes_on_with_other_settings_and_keeps_a_record(whole: pathlib.Pat
     assert run_log.read(copy).identity != run_log.read(whole).identity
 
 
+def test_fewer_steps_than_are_trained_are_refused_before_anything_compiles(copy: pathlib.Path, cli):
+    code, text, err = cli("train", copy / "config.toml", "--out", copy, "--resume", "--no-cache", "--steps", 100)
+    assert code == 2 and f"has {STEPS:,} steps already, more than the 100 asked for; --steps may only grow" in err
+    assert "compiling" not in text and load_config(copy / "config.toml").steps == STEPS
+
+
 @pytest.mark.full
 def test_a_run_that_has_ended_says_what_would_train(copy: pathlib.Path, cli):
     """It would drop the other settings otherwise."""
