@@ -107,12 +107,17 @@ def load_seed(
 def policy_function(setup: Setup, state: ActingState) -> Policy:
     """The mean action of one seed's policy: obs [N, O] -> action [N, A], padded entries 0.
 
-    A recurrent one is (obs, hidden [N, H]) -> (action, hidden); without `hidden` an episode begins.
+    A recurrent one is (obs, hidden [N, H]) -> (action, hidden); without `hidden` an episode begins. Both raise a
+    UsageError for observations of another shape.
     """
     mask = jnp.asarray(setup.vector.spec.action_mask)
     memory = setup.nets.start(1)
 
+    expected = (setup.vector.spec.num_agents, setup.vector.spec.obs_dim)
+
     def act(obs: jax.Array, hidden: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
+        if jnp.shape(obs)[-2:] != expected:
+            raise UsageError(f"this policy takes observations [..., N, O] that end in {expected}, not {jnp.shape(obs)}")
         with jax.default_matmul_precision(MATMUL_PRECISION):
             mean, _, hidden = setup.nets.act(state.actor.params, setup.scale(state.obs_moments, obs), hidden)
         return mean * mask, hidden

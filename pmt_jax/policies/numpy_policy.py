@@ -36,8 +36,11 @@ def load(path: str | os.PathLike[str]) -> Callable[..., Any]:
     with np.load(path) as file:
         w = dict(file)
     activation = ACTIVATIONS[str(w["activation"])]
+    expected = (len(w["kernel_0"]), len(w["obs_mean"]))
 
     def act(obs: np.ndarray, hidden: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        if np.shape(obs)[-2:] != expected:
+            raise ValueError(f"this policy takes observations [..., N, O] that end in {expected}, not {np.shape(obs)}")
         x = (np.asarray(obs, np.float32) - w["obs_mean"]) / w["obs_scale"]
         x = np.clip(x, -w["obs_clip"], w["obs_clip"])
         last = sum(name.startswith("kernel_") for name in w) - 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -34,6 +35,8 @@ def test_a_loaded_policy_is_what_was_evaluated(whole: pathlib.Path):
     for seed in (7, -1, 0.5, "last"):
         with pytest.raises(UsageError, match=f"has no seed {seed}; it has 0, 1"):
             load_policy(whole, seed=seed)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UsageError, match=re.escape("that end in (2, 8), not (8,)")):
+        policy(obs[0, 0])
 
 
 def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
@@ -49,6 +52,8 @@ def test_an_exported_policy(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
     alone = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     expected = load_policy(whole, seed=1, which="best")(jnp.ones((2, 8)))
     np.testing.assert_allclose(json.loads(alone.stdout), expected, rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match=re.escape("that end in (2, 8), not (3, 8)")):
+        numpy_policy.load(tmp_path / "policy.npz")(np.ones((3, 8)))
 
 
 def test_a_policy_exported_as_onnx(whole: pathlib.Path, tmp_path: pathlib.Path, cli):
