@@ -96,9 +96,11 @@ def path(text: str) -> pathlib.Path:
 def span(text: str) -> slice:
     """The type of FROM:TO or FROM:TO:EVERY, each part a whole number or nothing."""
     parts = text.split(":")
-    if len(parts) not in (2, 3) or parts[2:] == ["0"]:
-        raise argparse.ArgumentTypeError(f"must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{text}'")
-    return slice(*(whole(0)(part) if part else None for part in parts))
+    if len(parts) in (2, 3):
+        found = slice(*(whole(0)(part) if part else None for part in parts))
+        if found.step != 0:
+            return found
+    raise argparse.ArgumentTypeError(f"must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{text}'")
 
 
 def pixels(text: str) -> tuple[int, int]:
