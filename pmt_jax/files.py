@@ -17,14 +17,14 @@ Note = Callable[[str], object]  # called with a sentence about what is left out
 
 
 @contextlib.contextmanager
-def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A file next to `out` to write to, which replaces `out` when all has gone well.
+def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
+    """A file next to `out`, which `flag` named, to write to; it replaces `out` when all has gone well.
 
     Raises:
       UsageError: the folder cannot be written.
     """
     if not out.name:  # "", "." and "/", next to which no file can lie
-        raise UsageError(f"cannot write {out}: it is a folder; choose another -o")
+        raise UsageError(f"cannot write {out}: it is a folder; choose another {flag}")
     partial = out.with_stem(f".{out.stem}.partial")
     try:
         if out.exists() and not out.is_file() and not out.is_dir():
@@ -34,7 +34,7 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
         yield partial
         partial.replace(out)
     except OSError as error:
-        raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another -o") from error
+        raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another {flag}") from error
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -147,6 +147,6 @@ def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: i
     if str(out).startswith(minari_dataset.PREFIX):
         minari_dataset.write(str(out), table)
         return {name: x for name, x in results.items() if name not in recorded}
-    with writing(out) as partial, partial.open("wb") as file:
+    with writing(out, "--save") as partial, partial.open("wb") as file:
         np.savez_compressed(file, **table)
     return {name: x for name, x in results.items() if name not in recorded}

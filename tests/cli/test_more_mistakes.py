@@ -235,8 +235,8 @@ def test_a_pipe_is_written_and_never_replaced(tmp_path: pathlib.Path):
     assert os.read(both, 9) == b"table" and stat.S_ISFIFO(pipe.stat().st_mode)
     os.close(both)
     with (
-        pytest.raises(UsageError, match="cannot write /dev/full: No space left on device"),
-        writing(pathlib.Path("/dev/full")) as place,
+        pytest.raises(UsageError, match="cannot write /dev/full: No space left on device; choose another --save"),
+        writing(pathlib.Path("/dev/full"), "--save") as place,
     ):
         assert place == pathlib.Path("/dev/full")
         raise OSError(28, "No space left on device")
