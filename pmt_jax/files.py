@@ -40,6 +40,26 @@ def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
             partial.unlink(missing_ok=True)
 
 
+def check_writable(out: pathlib.Path, flag: str = "-o") -> None:
+    """Refuses early what `writing` would refuse after the work.
+
+    Raises:
+      UsageError: `out` is a folder, or the nearest folder that is there cannot be written.
+    """
+    there = next((path for path in out.parents if os.path.exists(path)), out)
+    if os.path.exists(out) and not os.path.isfile(out) and not os.path.isdir(out):
+        there = out  # a device or a pipe, as /dev/stdout
+    if os.path.isdir(out):
+        reason = "it is a folder"
+    elif os.path.isfile(there):
+        reason = f"{there} is a file, not a folder"
+    elif not os.access(there, os.W_OK):
+        reason = f"{there} cannot be written"
+    else:
+        return
+    raise UsageError(f"cannot write {out}: {reason}; choose another {flag}")
+
+
 @contextlib.contextmanager
 def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
     """A new folder next to `out` to write to; when all has gone well it becomes `out`, or its files move into it.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from ..errors import UsageError, optional
-from ..files import writing
+from ..files import check_writable, writing
 from . import network_map, page
 from .episode import Episode, record_run
 from .network_map import INK, PAPER
@@ -51,6 +51,7 @@ def render(
     """
     if out.suffix not in FORMATS:
         raise UsageError(f"cannot write {out}: its ending must be .mp4, .gif or .html")
+    check_writable(out)
     if out.suffix == ".mp4":
         optional("imageio_ffmpeg", "render")
     episode = record_run(folder, seed, number, deterministic).cut(moments)

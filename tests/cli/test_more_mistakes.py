@@ -171,6 +171,9 @@ plot run -o run | cannot write run: its ending must be .png, .svg or .pdf
 plot run -o .png | cannot write .png: its ending must be .png, .svg or .pdf
 plot run -o file/x.png | cannot write file/x.png: File exists
 report run -o .html | cannot write .html: the ending of a report must be .html
+report run -o file/x.html | cannot write file/x.html: file is a file, not a folder; choose another -o
+render run -o file/x.html | cannot write file/x.html: file is a file, not a folder; choose another -o
+eval run --save file/x.npz | cannot write file/x.npz: file is a file, not a folder; choose another --save
 report broken | broken/metrics.jsonl: a row has step = "x", where a whole number belongs
 table run --baseline nobody | no row is called 'nobody'
 table run --test | --test compares with a baseline
