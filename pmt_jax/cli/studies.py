@@ -43,7 +43,7 @@ def _add_sweep(commands: Any) -> None:
         help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]; "
         "or with --random a range: NAME=LOW:HIGH, NAME=log:LOW:HIGH",
     )
-    sweep.add_argument("--random", type=whole(0), default=0, metavar="N", help="draw N values from each range of --set")
+    sweep.add_argument("--random", type=whole(1), default=0, metavar="N", help="draw N values from each range of --set")
     sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="seed of these draws (default 0)")
     sweep.add_argument("--out", type=path, required=True, metavar="DIR", help="gets a run folder per point")
     sweep.add_argument(

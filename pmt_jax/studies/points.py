@@ -243,9 +243,10 @@ def _part(file: str | pathlib.Path, shared: dict[str, Any], table: dict[str, Any
     varied, draws, seed = (table.get(name, default) for name, default in PART.items())
     if not isinstance(varied, dict):
         raise UsageError(f"{file}: set must be a table of settings, like set.lambda_lr = [0.1, 0.3]")
-    for name, number in (("random", draws), ("draw_seed", seed)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-            raise UsageError(f"{file}: {name} must be a whole number, not {number!r}")
+    for name, least in (("random", 1), ("draw_seed", 0)):
+        number = table.get(name, least)
+        if isinstance(number, bool) or not isinstance(number, int) or number < least:
+            raise UsageError(f"{file}: {name} must be a whole number of at least {least}, not {number!r}")
     if not isinstance(method := merged.get("method", {}), dict):  # of a part; tables [method.NAME] stay
         merged["method"] = base.get("method", {})
         varied = {"method": method, **varied}

@@ -30,6 +30,7 @@ FILES = {
     "method.toml": b'task = "lane"\nmethod = "ppo"',
     "pairs.toml": b'task = "lane"\nenv = [1]',
     "empty_list.toml": b'extends = "lane"\n[[sweep]]\nset.clip = []',
+    "draws.toml": b'extends = "lane"\n[[sweep]]\nrandom = -1',
     "no_task.toml": b"clip = 0.1",
     "empty.py": b"",
     "syntax.py": b"def (",
@@ -131,6 +132,8 @@ sweep lane --set env=num_agents=2,num_agents=3 --env num_agents=4 --out s | the 
 sweep lane --set seed=0,1 --seeds 2 --out s | 'seed=0' and 'seed=1' would both train seed 1: with seeds = 2 their first
 sweep lane --set cost_limit=1,[1,2] --out s | cost_limit has 2 numbers, but task 'lane' has 1 cost(s); give one number
 sweep empty_list.toml --out s | clip varies over an empty list; give it at least one value
+sweep draws.toml --out s | draws.toml: random must be a whole number of at least 1, not -1
+sweep lane --random 0 --out s | --random must be a whole number of at least 1, not '0'
 sweep lane --set clip=0.1,0.2 --out run | run holds a run, not a sweep; choose another --out
 train no_task.toml | no_task.toml names no task; add extends = "TASK"
 train run | run/config.toml, and this continues it: pmt train run/config.toml --out run --resume

@@ -363,7 +363,7 @@ def test_a_part_extends_a_file_next_to_its_own(file: str, tmp_path: pathlib.Path
         ('task = "lane"', "nothing varies"),
         ("sweep = 3", "has no [sweep] table"),
         ('[sweep]\nextends = "lane"\nset = 3', "set must be a table of settings"),
-        ('[sweep]\nextends = "lane"\nrandom = 1.5', "random must be a whole number, not 1.5"),
+        ('[sweep]\nextends = "lane"\nrandom = 1.5', "random must be a whole number of at least 1, not 1.5"),
         ('[sweep]\nextends = "lane"\nclpi = 0.1', "unknown setting 'clpi'; did you mean 'clip'?"),
         (
             'task = "lane"\n[sweep]\nextends = "noisy"',
