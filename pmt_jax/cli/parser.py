@@ -37,10 +37,12 @@ class Parser(argparse.ArgumentParser):
         result(message.removesuffix("\n"))
 
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
-        """As `parse_args`, but an unknown flag gets the nearest known one."""
+        """As `parse_args`, but an unknown flag gets the nearest known one, or what a command has in its place."""
         known, unknown = self.parse_known_args(argv)
         if unknown and not unknown[0].startswith("-"):
             raise UsageError(f"unexpected word '{unknown[0]}' (see {self.prog} {known.command} --help)")
+        if unknown and (word := unknown[0].split("=")[0]) in getattr(known, "elsewhere", {}):
+            raise UsageError(f"unknown argument '{word}': {known.elsewhere[word]}")
         if unknown:
             flags = [f for a in _actions(self, known) for f in a.option_strings]
             raise UsageError(f"unknown argument '{unknown[0]}'{did_you_mean(unknown[0].split('=')[0], flags)}")

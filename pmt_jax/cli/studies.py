@@ -14,6 +14,11 @@ from .flags import add_settings, given
 from .parser import SOURCE, add_format, add_jobs, add_trust, command, path, whole
 from .process import interruptible, refuse_many
 
+OF_RUNS = {  # flags of `pmt train`, and what many runs have in their place
+    "--resume": "the same command without it continues what was interrupted",
+    "--workers": "only pmt train has workers; --jobs N trains N programs at a time",
+}
+
 
 def add(commands: Any) -> None:
     """Adds the commands."""
@@ -52,6 +57,7 @@ def _add_sweep(commands: Any) -> None:
         help="train share I of N of the programs; N such commands, also on several hosts that share DIR, finish the "
         "sweep (in a SLURM job array the task's own share; 1/1 for all)",
     )
+    sweep.set_defaults(elsewhere=OF_RUNS)
     add_jobs(sweep)
     add_trust(sweep)
     add_settings(sweep)
@@ -109,6 +115,7 @@ def _add_reproduce(commands: Any) -> None:
     reproduce.add_argument(
         "--out", type=path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
     )
+    reproduce.set_defaults(elsewhere=OF_RUNS)
     add_jobs(reproduce)
     add_format(reproduce)
 

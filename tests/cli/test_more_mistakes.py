@@ -143,6 +143,9 @@ sweep lane --set clip=a:b --random 2 --out s | random draws need a range
 sweep lane --set clip=0.1,0.2 --jobs 0 --out s | --jobs must be a whole number of at least 1, not '0'
 sweep lane --set env=num_agents=x,y --out s | env = ['y'] does not fit
 sweep lane --set clip=0.1,0.2 --seeds 0 --out s | seeds must be at least 1
+sweep lane --set clip=0.1,0.2 --out s --resume | unknown argument '--resume': the same command without it continues
+sweep lane --set clip=0.1,0.2 --out s --workers 2 | unknown argument '--workers': only pmt train has workers; --jobs N
+reproduce table1 --workers=2 | unknown argument '--workers': only pmt train has workers; --jobs N trains N programs
 sweep hub:ant_2x4/r4sg --set clip=0.1,0.2 --out s | unknown task 'hub:ant_2x4/r4sg'
 eval | the following arguments are required: RUN|TASK
 eval run run | unexpected word 'run' (see pmt eval --help)
