@@ -28,6 +28,7 @@ FILES = {
     "nested.toml": b'task = "lane"\n[clip]\nx = 1',
     "twice.toml": b'task = "lane"\nclip = 0.1\nclip = 0.2',
     "method.toml": b'task = "lane"\nmethod = "ppo"',
+    "both.toml": b'task = "lane"\nmethod = "f4sg"\n[method.macpo]\nclip = 0.1',
     "pairs.toml": b'task = "lane"\nenv = [1]',
     "empty_list.toml": b'extends = "lane"\n[[sweep]]\nset.clip = []',
     "draws.toml": b'extends = "lane"\n[[sweep]]\nrandom = -1',
@@ -59,6 +60,7 @@ train date.toml | seed = datetime.date(2026, 1, 1) does not fit: expected a whol
 train nested.toml | clip = {'x': 1} does not fit: expected a number
 train twice.toml | twice.toml is not valid TOML: Cannot overwrite a value
 train method.toml | unknown method 'ppo'; did you mean 'ippo'?
+train both.toml | both.toml: method = NAME and [method.NAME] tables exclude each other; keep the tables and choose
 train pairs.toml | env = [1] does not fit: expected name=value
 train missing.py:Env | there is no environment file
 train empty.py | should hold one class with reset and step
