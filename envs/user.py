@@ -250,5 +250,6 @@ def _guard(what: str, run: Callable[[], Any]) -> Any:
             raise TaskError(f"{what}: {error} ({place})") from error
         if isinstance(error, SyntaxError):
             place = f"{pathlib.Path(error.filename or '').name}, line {error.lineno}"
-        first = (str(error).splitlines() or [""])[0]
+        text = error.msg if isinstance(error, SyntaxError) else str(error)  # the latter has the place, too
+        first = (text.splitlines() or [""])[0]
         raise TaskError(f"{what}: {type(error).__name__}: {first} ({place})") from error

@@ -84,7 +84,7 @@ GOOD = EXAMPLE.read_text()
     [
         (None, "", "there is no environment file"),
         ("import nothing_of_that_name", "", "cannot be imported: ModuleNotFoundError: No module named 'nothing_of"),
-        ("x = (", "", "cannot be imported: SyntaxError: '(' was never closed (env.py, line 1)"),
+        ("x = (", "", "cannot be imported: SyntaxError: '(' was never closed (env.py, line 1)\n"),
         ("x = 1", "", "should hold one class with reset and step (see envs/base.py), but holds none"),
         (GOOD + "\n\nclass Other(Pole):\n    pass\n", "", "holds several (Pole, Other); choose one, as env.py:Pole"),
         (GOOD, ":Pol", "has no class or function 'Pol'; did you mean 'Pole'?"),
