@@ -112,7 +112,7 @@ train --preset smoke | the following arguments are required: TASK|CONFIG
 train lane --eval-episodes 0 --eval-interval 1 | eval_episodes must be at least 1
 train lane --loggers csv,csvv | unknown logger 'csvv'; did you mean 'csv'?
 train lane --devices 0 | --devices must be a whole number of at least 1, not '0'
-train lane --process 0 | --coordinator, --process, --processes belong together
+train lane --process 0 | --processes belong together; --coordinator and --processes are missing
 train lane --coordinator nowhere --process 0 --processes 2 | --coordinator must be HOST:PORT
 train lane --process 3 --processes 2 --coordinator a:1 | --process must be from 0 to 1 with --processes 2, not 3
 train lane --out /dev/null | /dev/null is a file, not a folder
