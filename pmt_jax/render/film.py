@@ -54,9 +54,10 @@ def render(
     check_writable(out)
     if out.suffix == ".mp4":
         optional("imageio_ffmpeg", "render")
-    episode = record_run(folder, seed, number, deterministic).cut(moments)
+    whole = record_run(folder, seed, number, deterministic)
+    episode = whole.cut(moments)
     if not len(episode):
-        raise UsageError("the episode has no such steps; leave --steps out to see how long it is")
+        raise UsageError(f"--steps chooses none of the episode's steps, which are 0 to {len(whole) - 1}")
     costly = int((episode.cost > 0).sum())
     task = episode.env.spec.name
     with writing(out) as partial:
