@@ -177,6 +177,8 @@ def run_table(arguments: argparse.Namespace) -> int:
         return 0
     with writing(arguments.output) as partial:
         partial.write_text(text)
+    if arguments.output.is_file():  # behind what goes to /dev/stdout it would be one more line of the table
+        say(f"wrote {arguments.output}")
     return 0
 
 
