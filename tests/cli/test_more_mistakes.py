@@ -158,7 +158,9 @@ eval ant_2x4/f4sg | is a pretrained policy, not a run folder; name it hub:ant_2x
 eval run | there is no finished checkpoint in run/checkpoints; train the run first
 eval run --episodes 1e3 | --episodes must be a whole number of at least 1, not '1e3'
 eval run --episodes 99999999999 | --episodes must be a whole number of at most 2147483647
-eval run --policy zero | unknown task 'run'
+eval run --policy zero | run is a run and no task: leave out --policy to evaluate it, or name a task
+eval lane | lane is a task and no run: name a folder that pmt train wrote; a baseline, which voltage
+eval none.py:Env | none.py:Env is a task and no run: name a folder
 eval lane --policy random --physics mujoco | --physics belongs to a run; leave out --policy
 eval voltage_33 --policy zero --env voltage=3 | task 'voltage_33' has no option 'voltage'
 eval hub: | unknown policy 'hub:'
