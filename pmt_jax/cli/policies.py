@@ -8,7 +8,8 @@ import pathlib
 from typing import Any
 
 from .. import numerics, tasks
-from ..config.load import convert
+from ..config.load import convert, expectation
+from ..config.settings import FIELDS
 from ..errors import UsageError
 from ..files import to_stderr
 from ..output import result, say
@@ -41,7 +42,8 @@ def add(commands: Any) -> None:
         "reward [S, E, T]; cost and true_cost [S, E, T, N, K]; terminated, truncated and info/NAME [S, E, T]; "
         "0 after the end of an episode",
     )
-    evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
+    engines = expectation(FIELDS["physics"])
+    evaluation.add_argument("--physics", metavar="WORD", help=f"an engine other than the run's: {engines}")
 
     export = command(
         commands,

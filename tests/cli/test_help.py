@@ -42,6 +42,13 @@ def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
     assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
 
 
+def test_help_names_every_engine(cli, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for words in (("train", "--help"), ("eval", "--help")):
+        text = cli(*words)[1]
+        assert all(f" {engine}" in text for engine in ("auto", *contract.ENGINES))
+
+
 def test_help_shows_what_most_people_set_and_where_the_rest_is(cli):
     """Twelve settings and no heading above nothing; all of them with `all`, before a task or after it."""
     named = {"method", "steps", "seeds", "seed", "num-envs", "rollout-length", "hidden", "actor-lr"}
