@@ -39,6 +39,7 @@ def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
     assert at == sorted(at) and out.index("--method") < out.index("--num-envs") < out.index("--lambda-lr")
     words = " ".join(out.split())
     assert "how far costs of twice the limit in every update" in words
+    assert "bit for bit, but not on the engine warp, which auto takes" in words  # as docs/howto/train.md says
     assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
 
 
