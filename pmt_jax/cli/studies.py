@@ -129,7 +129,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     if has_parts(source) and (words or draws):
         raise UsageError(f"{source} already has a sweep; leave out --set and --random")
     if not (words or has_parts(source)):
-        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
+        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [[sweep]] table")
     parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)
     points = make_points(parts, arguments.preset, **given(arguments))
     refuse_many("pmt sweep", arguments.jobs, arguments.devices)

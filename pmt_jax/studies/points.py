@@ -222,7 +222,7 @@ def has_parts(source: str) -> bool:
 
 
 def from_file(file: str | pathlib.Path) -> list[Part]:
-    """The parts in the [sweep] table, or the [[sweep]] tables, of a TOML file.
+    """The parts in the [[sweep]] tables, or in a single [sweep] table, of a TOML file.
 
     Raises:
       UsageError: no such file or table, or one of another form.
@@ -231,7 +231,7 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
     tables = shared.pop("sweep", [])
     tables = [tables] if isinstance(tables, dict) else tables
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
-        raise UsageError(f"{file} has no [sweep] table; add one, or --set NAME=VALUE,VALUE")
+        raise UsageError(f"{file} has no [[sweep]] table; add one, or --set NAME=VALUE,VALUE")
     return [_part(file, shared, dict(table)) for table in tables]
 
 
