@@ -118,6 +118,7 @@ def build(make: Callable[..., Any], name: str, options: dict[str, Any]) -> Env:
     if missing:
         raise TaskError(f"{name} does not keep the contract of envs/base.py: it has no {', '.join(missing)}")
     check_shapes(env, name)
+    _check_engine(env, name)
     if env.engine not in ("mjx", "warp"):  # these take minutes to compile, and training compiles them again
         _check_values(env, name)
     return env
@@ -147,6 +148,27 @@ def check_shapes(env: Env, name: str) -> None:
         if old != new:
             where = jax.tree_util.keystr(path)
             raise TaskError(f"{name}: step must keep what reset made, but {where} was {old} and became {new}")
+
+
+def _check_engine(env: Env, name: str) -> None:
+    """Compares the name of the engine with the known ones, and with what the task computes."""
+    import jax
+    import jax.numpy as jnp
+
+    from .physics import ENGINES
+
+    known = ("xla", *ENGINES)
+    if env.engine not in known:
+        raise TaskError(f"{name}: unknown engine '{env.engine}'{did_you_mean(str(env.engine), known)}")
+    if env.engine in ("xla", "mjx"):  # these run within XLA, where nothing tells them apart
+        return
+    action = jnp.zeros(env.spec.action_mask.shape)
+    program = jax.make_jaxpr(lambda key: env.step(env.reset(key), action))(jax.random.key(0))
+    if not re.search("ffi_call|callback", str(program)):
+        raise TaskError(
+            f"{name}: it has engine = '{env.engine}', but no step calls an engine; a task that is plain JAX has "
+            "engine = 'xla'"
+        )
 
 
 def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
@@ -228,5 +250,6 @@ def _guard(what: str, run: Callable[[], Any]) -> Any:
             raise TaskError(f"{what}: {error} ({place})") from error
         if isinstance(error, SyntaxError):
             place = f"{pathlib.Path(error.filename or '').name}, line {error.lineno}"
-        first = (str(error).splitlines() or [""])[0]
+        text = error.msg if isinstance(error, SyntaxError) else str(error)  # the latter has the place, too
+        first = (text.splitlines() or [""])[0]
         raise TaskError(f"{what}: {type(error).__name__}: {first} ({place})") from error

@@ -17,14 +17,14 @@ Note = Callable[[str], object]  # called with a sentence about what is left out
 
 
 @contextlib.contextmanager
-def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A file next to `out` to write to, which replaces `out` when all has gone well.
+def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
+    """A file next to `out`, which `flag` named, to write to; it replaces `out` when all has gone well.
 
     Raises:
       UsageError: the folder cannot be written.
     """
     if not out.name:  # "", "." and "/", next to which no file can lie
-        raise UsageError(f"cannot write {out}: it is a folder; choose another -o")
+        raise UsageError(f"cannot write {out}: it is a folder; choose another {flag}")
     partial = out.with_stem(f".{out.stem}.partial")
     try:
         if out.exists() and not out.is_file() and not out.is_dir():
@@ -34,10 +34,30 @@ def writing(out: pathlib.Path) -> Iterator[pathlib.Path]:
         yield partial
         partial.replace(out)
     except OSError as error:
-        raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another -o") from error
+        raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another {flag}") from error
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def check_writable(out: pathlib.Path, flag: str = "-o") -> None:
+    """Refuses early what `writing` would refuse after the work.
+
+    Raises:
+      UsageError: `out` is a folder, or the nearest folder that is there cannot be written.
+    """
+    there = next((path for path in out.parents if os.path.exists(path)), out)
+    if os.path.exists(out) and not os.path.isfile(out) and not os.path.isdir(out):
+        there = out  # a device or a pipe, as /dev/stdout
+    if os.path.isdir(out):
+        reason = "it is a folder"
+    elif os.path.isfile(there):
+        reason = f"{there} is a file, not a folder"
+    elif not os.access(there, os.W_OK):
+        reason = f"{there} cannot be written"
+    else:
+        return
+    raise UsageError(f"cannot write {out}: {reason}; choose another {flag}")
 
 
 @contextlib.contextmanager

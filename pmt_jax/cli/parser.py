@@ -37,10 +37,12 @@ class Parser(argparse.ArgumentParser):
         result(message.removesuffix("\n"))
 
     def parse_all(self, argv: Sequence[str]) -> argparse.Namespace:
-        """As `parse_args`, but an unknown flag gets the nearest known one."""
+        """As `parse_args`, but an unknown flag gets the nearest known one, or what a command has in its place."""
         known, unknown = self.parse_known_args(argv)
         if unknown and not unknown[0].startswith("-"):
             raise UsageError(f"unexpected word '{unknown[0]}' (see {self.prog} {known.command} --help)")
+        if unknown and (word := unknown[0].split("=")[0]) in getattr(known, "elsewhere", {}):
+            raise UsageError(f"unknown argument '{word}': {known.elsewhere[word]}")
         if unknown:
             flags = [f for a in _actions(self, known) for f in a.option_strings]
             raise UsageError(f"unknown argument '{unknown[0]}'{did_you_mean(unknown[0].split('=')[0], flags)}")
@@ -96,9 +98,11 @@ def path(text: str) -> pathlib.Path:
 def span(text: str) -> slice:
     """The type of FROM:TO or FROM:TO:EVERY, each part a whole number or nothing."""
     parts = text.split(":")
-    if len(parts) not in (2, 3) or parts[2:] == ["0"]:
-        raise argparse.ArgumentTypeError(f"must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{text}'")
-    return slice(*(whole(0)(part) if part else None for part in parts))
+    if len(parts) in (2, 3):
+        found = slice(*(whole(0)(part) if part else None for part in parts))
+        if found.step != 0:
+            return found
+    raise argparse.ArgumentTypeError(f"must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '{text}'")
 
 
 def pixels(text: str) -> tuple[int, int]:

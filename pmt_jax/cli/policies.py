@@ -7,8 +7,9 @@ import math
 import pathlib
 from typing import Any
 
-from .. import numerics
-from ..config.load import convert
+from .. import numerics, tasks
+from ..config.load import convert, expectation
+from ..config.settings import FIELDS
 from ..errors import UsageError
 from ..files import to_stderr
 from ..output import result, say
@@ -41,7 +42,8 @@ def add(commands: Any) -> None:
         "reward [S, E, T]; cost and true_cost [S, E, T, N, K]; terminated, truncated and info/NAME [S, E, T]; "
         "0 after the end of an episode",
     )
-    evaluation.add_argument("--physics", metavar="WORD", help="an engine other than the run's: auto, mjx, warp, mujoco")
+    engines = expectation(FIELDS["physics"])
+    evaluation.add_argument("--physics", metavar="WORD", help=f"an engine other than the run's: {engines}")
 
     export = command(
         commands,
@@ -67,6 +69,7 @@ def run_eval(arguments: argparse.Namespace) -> int:
         if getattr(arguments, flag) is not None:
             why = "belongs to a run; leave out --policy" if arguments.policy else "needs --policy: a run keeps its task"
             raise UsageError(f"--{flag} {why}")
+    _check_kind(arguments.source, arguments.policy)
     numerics.check()
     from ..policies import evaluate
     from ..trust import check_source, trusting
@@ -92,6 +95,21 @@ def run_eval(arguments: argparse.Namespace) -> int:
     if arguments.save:
         result(f"wrote every step to {arguments.save}")
     return 0
+
+
+def _check_kind(source: str, policy: str | None) -> None:
+    """Refuses a task where a run is expected, and a run where a task is."""
+    is_run = source.startswith("hub:") or (pathlib.Path(source) / "config.toml").is_file()
+    is_task = source in tasks.names() or tasks.is_file(source)
+    if policy is None and is_task and not is_run:
+        raise UsageError(
+            f"{source} is a task and no run: name a folder that pmt train wrote; a baseline, which voltage and "
+            "multi_goal tasks have, needs --policy"
+        )
+    if policy is not None and is_run and not is_task:
+        raise UsageError(
+            f"{source} is a run and no task: leave out --policy to evaluate it, or name a task, which pmt envs lists"
+        )
 
 
 def say_row(row: dict[str, Any]) -> None:

@@ -14,6 +14,11 @@ from .flags import add_settings, given
 from .parser import SOURCE, add_format, add_jobs, add_trust, command, path, whole
 from .process import interruptible, refuse_many
 
+OF_RUNS = {  # flags of `pmt train`, and what many runs have in their place
+    "--resume": "the same command without it continues what was interrupted",
+    "--workers": "only pmt train has workers; --jobs N trains N programs at a time",
+}
+
 
 def add(commands: Any) -> None:
     """Adds the commands."""
@@ -43,7 +48,7 @@ def _add_sweep(commands: Any) -> None:
         help="a setting's values, method included; a value with commas goes into brackets: hidden=[64,64],[128,128]; "
         "or with --random a range: NAME=LOW:HIGH, NAME=log:LOW:HIGH",
     )
-    sweep.add_argument("--random", type=whole(0), default=0, metavar="N", help="draw N values from each range of --set")
+    sweep.add_argument("--random", type=whole(1), default=0, metavar="N", help="draw N values from each range of --set")
     sweep.add_argument("--draw-seed", type=whole(0), default=0, metavar="N", help="seed of these draws (default 0)")
     sweep.add_argument("--out", type=path, required=True, metavar="DIR", help="gets a run folder per point")
     sweep.add_argument(
@@ -52,6 +57,7 @@ def _add_sweep(commands: Any) -> None:
         help="train share I of N of the programs; N such commands, also on several hosts that share DIR, finish the "
         "sweep (in a SLURM job array the task's own share; 1/1 for all)",
     )
+    sweep.set_defaults(elsewhere=OF_RUNS)
     add_jobs(sweep)
     add_trust(sweep)
     add_settings(sweep)
@@ -109,6 +115,7 @@ def _add_reproduce(commands: Any) -> None:
     reproduce.add_argument(
         "--out", type=path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
     )
+    reproduce.set_defaults(elsewhere=OF_RUNS)
     add_jobs(reproduce)
     add_format(reproduce)
 
@@ -122,7 +129,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     if has_parts(source) and (words or draws):
         raise UsageError(f"{source} already has a sweep; leave out --set and --random")
     if not (words or has_parts(source)):
-        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table")
+        raise UsageError("nothing varies: give --set NAME=VALUE,..., or a TOML file with a [[sweep]] table")
     parts = [from_words(source, words, draws, arguments.draw_seed)] if words else from_file(source)
     points = make_points(parts, arguments.preset, **given(arguments))
     refuse_many("pmt sweep", arguments.jobs, arguments.devices)
@@ -170,6 +177,8 @@ def run_table(arguments: argparse.Namespace) -> int:
         return 0
     with writing(arguments.output) as partial:
         partial.write_text(text)
+    if arguments.output.is_file():  # behind what goes to /dev/stdout it would be one more line of the table
+        say(f"wrote {arguments.output}")
     return 0
 
 

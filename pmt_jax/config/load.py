@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import os
 import pathlib
+import re
 import shlex
 import tomllib
 import typing
@@ -220,12 +221,23 @@ def _parse(path: pathlib.Path) -> Table:
     try:
         return tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        if isinstance(error, tomllib.TOMLDecodeError) and _names_and_tables(path.read_text()):
+            raise UsageError(
+                f"{path}: method = NAME and [method.NAME] tables exclude each other; keep the tables and choose with "
+                "--method, or move the one method's settings above all tables"
+            ) from None
         raise UsageError(f"{path} is not valid TOML: {error}") from None
     except FileNotFoundError:
         raise UsageError(f"there is no configuration file {path}") from None
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"cannot read the configuration file {path}: {reason}") from None
+
+
+def _names_and_tables(text: str) -> bool:
+    """Whether a TOML file names one method above its tables, of which one is of a method."""
+    above, _, _ = text.partition("\n[")
+    return bool(re.search(r"^\s*method\s*=", above, re.MULTILINE) and re.search(r"^\[\s*method\.", text, re.MULTILINE))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

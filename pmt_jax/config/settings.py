@@ -141,7 +141,9 @@ class Config(Hyper):
     )
     seeds: int = common(1, "number of seeds that train side by side in one program", COUNT)
     seed: int = common(
-        0, "the first seed; the others count up from it. Runs repeat bit for bit, but for the hands on a GPU"
+        0,
+        "the first seed; the others count up from it. Runs repeat bit for bit, but not on the engine warp, which auto "
+        "takes for the hands on a GPU",
     )
     init: str = common("", "run folder or pretrained policy; the run starts from its networks and running moments")
     num_envs: int = sizes(64, "environments per seed, B", COUNT)

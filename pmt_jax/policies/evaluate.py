@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import tasks
 from ..errors import UsageError
-from ..files import writing
+from ..files import check_writable, writing
 from ..learning.evaluation import STEP, play
 from ..learning.setup import Setup
 from ..learning.types import ActingState
@@ -53,7 +53,7 @@ def evaluate_run(
     Raises:
       UsageError: there is no such run, the physics lost contacts, or `save` cannot be written.
     """
-    _check_ending(save)
+    _check_place(save)
     chosen = which == "best" or hub.is_name(out)
     return evaluate_states(*load_run(out, which, physics, say), episodes, deterministic, fresh=chosen, save=save)
 
@@ -98,7 +98,7 @@ def evaluate_baseline(
     Raises:
       UsageError: unknown task, option or policy, or `save` cannot be written.
     """
-    _check_ending(save)
+    _check_place(save)
     env = tasks.make(task, **options)
     act = jax.vmap(tasks.baseline(env, policy))
     record = save is not None
@@ -123,11 +123,14 @@ def _take_faults(results: dict[str, np.ndarray]) -> list[str]:
     return [faults({name: x[i] for name, x in counts.items()}, total) for i, total in enumerate(steps)]
 
 
-def _check_ending(save: pathlib.Path | None) -> None:
+def _check_place(save: pathlib.Path | None) -> None:
+    """Refuses, before anything is evaluated, what could not be written."""
     if save is not None and str(save).startswith(minari_dataset.PREFIX):
         minari_dataset.check(str(save))
     elif save is not None and save.suffix != ".npz":
         raise UsageError(f"cannot write {save}: its ending must be .npz, or its beginning {minari_dataset.PREFIX}")
+    elif save is not None:
+        check_writable(save, "--save")
 
 
 def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: int) -> dict[str, np.ndarray]:
@@ -147,6 +150,6 @@ def _save_steps(out: pathlib.Path, results: dict[str, np.ndarray], first_seed: i
     if str(out).startswith(minari_dataset.PREFIX):
         minari_dataset.write(str(out), table)
         return {name: x for name, x in results.items() if name not in recorded}
-    with writing(out) as partial, partial.open("wb") as file:
+    with writing(out, "--save") as partial, partial.open("wb") as file:
         np.savez_compressed(file, **table)
     return {name: x for name, x in results.items() if name not in recorded}

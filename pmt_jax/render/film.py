@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from ..errors import UsageError, optional
-from ..files import writing
+from ..files import check_writable, writing
 from . import network_map, page
 from .episode import Episode, record_run
 from .network_map import INK, PAPER
@@ -51,11 +51,13 @@ def render(
     """
     if out.suffix not in FORMATS:
         raise UsageError(f"cannot write {out}: its ending must be .mp4, .gif or .html")
+    check_writable(out)
     if out.suffix == ".mp4":
         optional("imageio_ffmpeg", "render")
-    episode = record_run(folder, seed, number, deterministic).cut(moments)
+    whole = record_run(folder, seed, number, deterministic)
+    episode = whole.cut(moments)
     if not len(episode):
-        raise UsageError("the episode has no such steps; leave --steps out to see how long it is")
+        raise UsageError(f"--steps chooses none of the episode's steps, which are 0 to {len(whole) - 1}")
     costly = int((episode.cost > 0).sum())
     task = episode.env.spec.name
     with writing(out) as partial:

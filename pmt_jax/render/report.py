@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import UsageError
-from ..files import writing
+from ..files import check_writable, writing
 from ..limits import WORST
 from ..policies import evaluate
 from ..studies import plot, table
@@ -41,6 +41,7 @@ def report(
     """
     if out.suffix != ".html":
         raise UsageError(f"cannot write {out}: the ending of a report must be .html")
+    check_writable(out)
     logs = read_all(folders, say)
     title = _title(logs)
     body = [*_heading(title, logs), *_or_reason(lambda: scores(logs)), *_curve_sections(plot.pooled(logs, say))]

@@ -15,7 +15,8 @@ from .rows import TableRow, compared, rows
 from .run_log import Group, groups, read_all
 
 NOTES = (
-    "A seed's score is its mean over the last tenth of its steps. Scores are means over seeds [95 %, Student].",
+    "A seed's score is its mean over the last tenth of its steps.",
+    "Scores are means over seeds [95 %, Student; of costs cut at 0].",
     "difference: the first less the second [95 %, Welch; of shares Newcombe].",
     "P: probability that a seed of the first has more reward (less cost) than one of the second; ties half [Newcombe].",
     "-: a seed has no score; [-]: one seed has no interval.",
@@ -50,7 +51,7 @@ def compare(first: pathlib.Path, second: pathlib.Path, picture: pathlib.Path | N
     head += ["difference", "P"]
     reward, cost = compared([ours, theirs])
     body = [_line(reward, ours.score(reward), theirs.score(reward), 1)]
-    body += [_line(f"{cost} (limit {_both(ours, theirs, cost)})", ours.score(cost), theirs.score(cost), -1)]
+    body += [_line(f"{cost} (limit {_both(ours, theirs, cost)})", ours.score(cost), theirs.score(cost), -1, least=0)]
     body += [_within(ours.beyond, theirs.beyond)]
     return formats.write(head, body, "text", NOTES)
 
@@ -77,9 +78,13 @@ def _both(ours: TableRow, theirs: TableRow, cost: str) -> str:
     return " and ".join(limits)
 
 
-def _line(name: str, x: np.ndarray, y: np.ndarray, sign: int) -> list[str]:
-    """A measure's scores [seeds] of both sides, of which more (sign 1) or less (-1) is better."""
-    cells = [_cell(float(side.mean()), statistics.mean_interval(side)) for side in (x, y)]
+def _line(name: str, x: np.ndarray, y: np.ndarray, sign: int, least: float = -math.inf) -> list[str]:
+    """A measure's scores [seeds] of both sides, of which more (sign 1) or less (-1) is better, and none below `least`.
+
+    The intervals of means are cut there, as those of the table are; a difference may have either sign.
+    """
+    intervals = [statistics.mean_interval(side) for side in (x, y)]
+    cells = [_cell(float(s.mean()), (max(low, least), high)) for s, (low, high) in zip((x, y), intervals, strict=True)]
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         return [name, *cells, "-", "-"]
     difference = _cell(float(x.mean() - y.mean()), statistics.difference_interval(x, y))

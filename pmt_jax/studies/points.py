@@ -227,7 +227,7 @@ def has_parts(source: str) -> bool:
 
 
 def from_file(file: str | pathlib.Path) -> list[Part]:
-    """The parts in the [sweep] table, or the [[sweep]] tables, of a TOML file.
+    """The parts in the [[sweep]] tables, or in a single [sweep] table, of a TOML file.
 
     Raises:
       UsageError: no such file or table, or one of another form.
@@ -236,7 +236,7 @@ def from_file(file: str | pathlib.Path) -> list[Part]:
     tables = shared.pop("sweep", [])
     tables = [tables] if isinstance(tables, dict) else tables
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
-        raise UsageError(f"{file} has no [sweep] table; add one, or --set NAME=VALUE,VALUE")
+        raise UsageError(f"{file} has no [[sweep]] table; add one, or --set NAME=VALUE,VALUE")
     return [_part(file, shared, dict(table)) for table in tables]
 
 
@@ -248,9 +248,10 @@ def _part(file: str | pathlib.Path, shared: dict[str, Any], table: dict[str, Any
     varied, draws, seed = (table.get(name, default) for name, default in PART.items())
     if not isinstance(varied, dict):
         raise UsageError(f"{file}: set must be a table of settings, like set.lambda_lr = [0.1, 0.3]")
-    for name, number in (("random", draws), ("draw_seed", seed)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-            raise UsageError(f"{file}: {name} must be a whole number, not {number!r}")
+    for name, least in (("random", 1), ("draw_seed", 0)):
+        number = table.get(name, least)
+        if isinstance(number, bool) or not isinstance(number, int) or number < least:
+            raise UsageError(f"{file}: {name} must be a whole number of at least {least}, not {number!r}")
     if not isinstance(method := merged.get("method", {}), dict):  # of a part; tables [method.NAME] stay
         merged["method"] = base.get("method", {})
         varied = {"method": method, **varied}

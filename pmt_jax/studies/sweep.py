@@ -81,7 +81,7 @@ def prepare(parts: Sequence[Part], points: Points, out: pathlib.Path, say: Say) 
     if values := drawn(parts, points):
         seeds = ", ".join(str(part.seed) for part in parts if part.ranges)
         say(f"drawn with seed {seeds}: {out / 'draws.json'}")
-        with writing(out / "draws.json") as partial:
+        with writing(out / "draws.json", "--out") as partial:
             partial.write_text(json.dumps(values, indent=1) + "\n")
     configs = [config for program in wanted for config in program.points.values()]
     if len({_needs(config) for config in configs}) > 1:  # a single one shows when its program is made

@@ -24,11 +24,12 @@ import orbax.checkpoint as ocp
 
 from ..errors import UsageError
 from ..learning import sharding
-from . import processes
+from . import lock, processes
 from .history import checkpoint_steps
 from .provenance import Provenance
 
 KEEP = 2
+CHECKPOINT_SECONDS = 300.0  # of training between two
 DAMAGED = "checkpoints-damaged"  # where a run that continues puts what it could not read
 _PROVENANCE = "provenance"  # its name in the npz, next to the paths of arrays
 ROW = "['row']"  # before the names of what is known of a row that has not ended
@@ -151,7 +152,18 @@ def newest(folder: pathlib.Path, warn: Callable[[str], object], to_continue: boo
         return Saved(step, packed, row, _provenance(place, step, packed.pop(_PROVENANCE, None), warn), damaged)
     if steps:
         raise UsageError(f"no checkpoint in {place} can be read; restore one from a backup or train anew")
-    raise UsageError(f"there is no finished checkpoint in {place}; train the run first")
+    raise nothing_finished(folder)
+
+
+def nothing_finished(folder: pathlib.Path) -> UsageError:
+    """The error of a run folder without a checkpoint, which says if the run trains now."""
+    none, owner = f"there is no finished checkpoint in {folder / 'checkpoints'}", lock.owner_of(folder)
+    if owner is None:
+        return UsageError(f"{none}; train the run first")
+    return UsageError(
+        f"{none}: {owner} trains the run; try again after its first checkpoint, which comes after "
+        f"{CHECKPOINT_SECONDS / 60:g} minutes of training, or when training ends"
+    )
 
 
 def _provenance(

@@ -85,6 +85,19 @@ def is_held(folder: pathlib.Path) -> bool:
     return folder in _held and _held[folder].holds
 
 
+def owner_of(folder: pathlib.Path) -> str | None:
+    """Which process may train in `folder` now, and since when, as words; None if none does."""
+    try:  # only to read: a lock, even a short one, would refuse a run that begins meanwhile
+        file = os.open(folder / NAME, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        owner = _read(file)
+    finally:
+        os.close(file)
+    return _words(owner) if _may_be_alive(owner, locked=False) else None
+
+
 def release_all() -> None:
     """Releases all locks of this process, for an end at once."""
     for folder in list(_held):
@@ -164,8 +177,12 @@ def _may_be_alive(owner: dict[str, Any], locked: bool) -> bool:
 
 
 def _refusal(folder: pathlib.Path, owner: dict[str, Any]) -> InUse:
+    here = owner.get("host", socket.gethostname()) == socket.gethostname()
+    gone = "" if here else f"; if that process is gone, delete {folder / NAME}"
+    return InUse(f"{folder} is in use by {_words(owner)}{gone}; wait for it, or choose another --out")
+
+
+def _words(owner: dict[str, Any]) -> str:
     host = owner.get("host", socket.gethostname())
     who = f"process {owner.get('pid', '?')}{'' if host == socket.gethostname() else f' on {host}'}"
-    since = f" since {owner['since']}" if "since" in owner else ""
-    gone = "" if host == socket.gethostname() else f"; if that process is gone, delete {folder / NAME}"
-    return InUse(f"{folder} is in use by {who}{since}{gone}; wait for it, or choose another --out")
+    return f"{who} since {owner['since']}" if "since" in owner else who

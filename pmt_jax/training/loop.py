@@ -26,7 +26,7 @@ from ..learning.setup import Setup
 from ..learning.types import Best, LearnerState
 from ..output import Say, say
 from . import chunks, failures, final, health, lock, processes
-from .checkpoint import unpack
+from .checkpoint import CHECKPOINT_SECONDS, unpack
 from .compile import Programs
 from .history import checkpoint_steps
 from .loggers import Profile
@@ -36,7 +36,6 @@ from .run_folder import RunFolder
 from .signals import Interrupts
 from .workers import WorkerLost
 
-CHECKPOINT_SECONDS = 300.0
 Conclude = Callable[[pathlib.Path], Sequence[str]]
 MOST_REASONS = 5  # of seeds that broke, printed at the end
 

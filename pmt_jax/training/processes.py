@@ -64,7 +64,8 @@ def join(coordinator: str | None, process: int | None, processes: int | None, de
     given = {"--coordinator": coordinator, "--process": process, "--processes": processes}
     missing = [flag for flag, value in given.items() if value is None]
     if missing and len(missing) < len(given):
-        raise UsageError(f"{', '.join(given)} belong together; {' and '.join(missing)} is missing")
+        is_or_are = "is" if len(missing) == 1 else "are"
+        raise UsageError(f"{', '.join(given)} belong together; {' and '.join(missing)} {is_or_are} missing")
     if missing and not in_step():
         make_room(devices)
         return

@@ -27,7 +27,7 @@ from ..learning.types import Best, LearnerState
 from ..output import Say
 from ..tasks import installed_version
 from . import final, lock, processes
-from .checkpoint import Checkpoints, Saved, check_name, newest, unpack
+from .checkpoint import Checkpoints, Saved, check_name, newest, nothing_finished, unpack
 from .history import Row, checkpoint_steps, missing_rows, read_changes
 from .loggers import Jsonl, Logger, open_loggers
 from .provenance import Provenance, check_machine, check_settings, listed, recorded_versions
@@ -401,7 +401,7 @@ def load_saved(
     if not (folder / "config.toml").is_file():
         raise UsageError(f"{folder} is not a run folder: {_what_it_is(folder)}")
     if not (folder / "checkpoints").is_dir():
-        raise UsageError(f"there is no finished checkpoint in {folder / 'checkpoints'}; train the run first")
+        raise nothing_finished(folder)
     config = load_config(folder / "config.toml")
     setup = make_setup(config if physics is None else config.replace(physics=physics))
     saved = _newest(folder, warn)

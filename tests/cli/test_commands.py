@@ -13,6 +13,7 @@ import time
 import pytest
 
 from pmt_jax.cli.commands import SHELLS
+from pmt_jax.training import lock
 from runs import ARGUMENTS, STEPS, environment, rows
 
 
@@ -125,6 +126,9 @@ def test_run_folders_that_are_none(tmp_path: pathlib.Path, cli):
     (tmp_path / "config.toml").write_text('task = "lane"\n')
     code, _, err = cli("eval", tmp_path)
     assert code == 2 and "there is no finished checkpoint" in err
+    with lock.acquire(tmp_path):
+        code, _, err = cli("eval", tmp_path)
+    assert code == 2 and f"process {os.getpid()} since" in err and "first checkpoint" in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

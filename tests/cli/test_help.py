@@ -39,7 +39,15 @@ def test_help_of_train_has_groups_and_explains_presets(cli, monkeypatch):
     assert at == sorted(at) and out.index("--method") < out.index("--num-envs") < out.index("--lambda-lr")
     words = " ".join(out.split())
     assert "how far costs of twice the limit in every update" in words
+    assert "bit for bit, but not on the engine warp, which auto takes" in words  # as docs/howto/train.md says
     assert "smoke: tiny networks" in words and "reference: what the published baselines' code does" in words
+
+
+def test_help_names_every_engine(cli, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for words in (("train", "--help"), ("eval", "--help")):
+        text = cli(*words)[1]
+        assert all(f" {engine}" in text for engine in ("auto", *contract.ENGINES))
 
 
 def test_help_shows_what_most_people_set_and_where_the_rest_is(cli):

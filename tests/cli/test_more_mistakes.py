@@ -28,8 +28,10 @@ FILES = {
     "nested.toml": b'task = "lane"\n[clip]\nx = 1',
     "twice.toml": b'task = "lane"\nclip = 0.1\nclip = 0.2',
     "method.toml": b'task = "lane"\nmethod = "ppo"',
+    "both.toml": b'task = "lane"\nmethod = "f4sg"\n[method.macpo]\nclip = 0.1',
     "pairs.toml": b'task = "lane"\nenv = [1]',
     "empty_list.toml": b'extends = "lane"\n[[sweep]]\nset.clip = []',
+    "draws.toml": b'extends = "lane"\n[[sweep]]\nrandom = -1',
     "no_task.toml": b"clip = 0.1",
     "empty.py": b"",
     "syntax.py": b"def (",
@@ -58,6 +60,7 @@ train date.toml | seed = datetime.date(2026, 1, 1) does not fit: expected a whol
 train nested.toml | clip = {'x': 1} does not fit: expected a number
 train twice.toml | twice.toml is not valid TOML: Cannot overwrite a value
 train method.toml | unknown method 'ppo'; did you mean 'ippo'?
+train both.toml | both.toml: method = NAME and [method.NAME] tables exclude each other; keep the tables and choose
 train pairs.toml | env = [1] does not fit: expected name=value
 train missing.py:Env | there is no environment file
 train empty.py | should hold one class with reset and step
@@ -109,7 +112,7 @@ train --preset smoke | the following arguments are required: TASK|CONFIG
 train lane --eval-episodes 0 --eval-interval 1 | eval_episodes must be at least 1
 train lane --loggers csv,csvv | unknown logger 'csvv'; did you mean 'csv'?
 train lane --devices 0 | --devices must be a whole number of at least 1, not '0'
-train lane --process 0 | --coordinator, --process, --processes belong together
+train lane --process 0 | --processes belong together; --coordinator and --processes are missing
 train lane --coordinator nowhere --process 0 --processes 2 | --coordinator must be HOST:PORT
 train lane --process 3 --processes 2 --coordinator a:1 | --process must be from 0 to 1 with --processes 2, not 3
 train lane --out /dev/null | /dev/null is a file, not a folder
@@ -131,6 +134,8 @@ sweep lane --set env=num_agents=2,num_agents=3 --env num_agents=4 --out s | the 
 sweep lane --set seed=0,1 --seeds 2 --out s | 'seed=0' and 'seed=1' would both train seed 1: with seeds = 2 their first
 sweep lane --set cost_limit=1,[1,2] --out s | cost_limit has 2 numbers, but task 'lane' has 1 cost(s); give one number
 sweep empty_list.toml --out s | clip varies over an empty list; give it at least one value
+sweep draws.toml --out s | draws.toml: random must be a whole number of at least 1, not -1
+sweep lane --random 0 --out s | --random must be a whole number of at least 1, not '0'
 sweep lane --set clip=0.1,0.2 --out run | run holds a run, not a sweep; choose another --out
 train no_task.toml | no_task.toml names no task; add extends = "TASK"
 train run | run/config.toml, and this continues it: pmt train run/config.toml --out run --resume
@@ -140,6 +145,9 @@ sweep lane --set clip=a:b --random 2 --out s | random draws need a range
 sweep lane --set clip=0.1,0.2 --jobs 0 --out s | --jobs must be a whole number of at least 1, not '0'
 sweep lane --set env=num_agents=x,y --out s | env = ['y'] does not fit
 sweep lane --set clip=0.1,0.2 --seeds 0 --out s | seeds must be at least 1
+sweep lane --set clip=0.1,0.2 --out s --resume | unknown argument '--resume': the same command without it continues
+sweep lane --set clip=0.1,0.2 --out s --workers 2 | unknown argument '--workers': only pmt train has workers; --jobs N
+reproduce table1 --workers=2 | unknown argument '--workers': only pmt train has workers; --jobs N trains N programs
 sweep hub:ant_2x4/r4sg --set clip=0.1,0.2 --out s | unknown task 'hub:ant_2x4/r4sg'
 eval | the following arguments are required: RUN|TASK
 eval run run | unexpected word 'run' (see pmt eval --help)
@@ -150,7 +158,9 @@ eval ant_2x4/f4sg | is a pretrained policy, not a run folder; name it hub:ant_2x
 eval run | there is no finished checkpoint in run/checkpoints; train the run first
 eval run --episodes 1e3 | --episodes must be a whole number of at least 1, not '1e3'
 eval run --episodes 99999999999 | --episodes must be a whole number of at most 2147483647
-eval run --policy zero | unknown task 'run'
+eval run --policy zero | run is a run and no task: leave out --policy to evaluate it, or name a task
+eval lane | lane is a task and no run: name a folder that pmt train wrote; a baseline, which voltage
+eval none.py:Env | none.py:Env is a task and no run: name a folder
 eval lane --policy random --physics mujoco | --physics belongs to a run; leave out --policy
 eval voltage_33 --policy zero --env voltage=3 | task 'voltage_33' has no option 'voltage'
 eval hub: | unknown policy 'hub:'
@@ -171,6 +181,9 @@ plot run -o run | cannot write run: its ending must be .png, .svg or .pdf
 plot run -o .png | cannot write .png: its ending must be .png, .svg or .pdf
 plot run -o file/x.png | cannot write file/x.png: File exists
 report run -o .html | cannot write .html: the ending of a report must be .html
+report run -o file/x.html | cannot write file/x.html: file is a file, not a folder; choose another -o
+render run -o file/x.html | cannot write file/x.html: file is a file, not a folder; choose another -o
+eval run --save file/x.npz | cannot write file/x.npz: file is a file, not a folder; choose another --save
 report broken | broken/metrics.jsonl: a row has step = "x", where a whole number belongs
 table run --baseline nobody | no row is called 'nobody'
 table run --test | --test compares with a baseline
@@ -235,8 +248,8 @@ def test_a_pipe_is_written_and_never_replaced(tmp_path: pathlib.Path):
     assert os.read(both, 9) == b"table" and stat.S_ISFIFO(pipe.stat().st_mode)
     os.close(both)
     with (
-        pytest.raises(UsageError, match="cannot write /dev/full: No space left on device"),
-        writing(pathlib.Path("/dev/full")) as place,
+        pytest.raises(UsageError, match="cannot write /dev/full: No space left on device; choose another --save"),
+        writing(pathlib.Path("/dev/full"), "--save") as place,
     ):
         assert place == pathlib.Path("/dev/full")
         raise OSError(28, "No space left on device")

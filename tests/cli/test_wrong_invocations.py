@@ -139,6 +139,7 @@ def test_a_file_of_any_bytes_is_read_or_gets_a_sentence(text: bytes):
         ("train lane --actor-lr 1e39", "actor_lr must be a number that is not negative and fits 32 bits"),
         ("render none --episode 4294967296", "--episode must be a whole number of at most 2147483647"),
         ("render none --steps 3:1:0", "--steps must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '3:1:0'"),
+        ("render none --steps 0:5:00", "--steps must be FROM:TO or FROM:TO:EVERY, like 100:300:2, not '0:5:00'"),
         ("render none --size 8x8", "--size must be a whole number of at least 32, not '8'"),
         ("eval none --env foo=1", "--env needs --policy: a run keeps its task"),
         ("eval voltage_33 --policy zero --which best", "--which belongs to a run; leave out --policy"),

@@ -84,11 +84,14 @@ GOOD = EXAMPLE.read_text()
     [
         (None, "", "there is no environment file"),
         ("import nothing_of_that_name", "", "cannot be imported: ModuleNotFoundError: No module named 'nothing_of"),
-        ("x = (", "", "cannot be imported: SyntaxError: '(' was never closed (env.py, line 1)"),
+        ("x = (", "", "cannot be imported: SyntaxError: '(' was never closed (env.py, line 1)\n"),
         ("x = 1", "", "should hold one class with reset and step (see envs/base.py), but holds none"),
         (GOOD + "\n\nclass Other(Pole):\n    pass\n", "", "holds several (Pole, Other); choose one, as env.py:Pole"),
         (GOOD, ":Pol", "has no class or function 'Pol'; did you mean 'Pole'?"),
         (GOOD.replace('engine = "xla"', "pass"), "", "it has no engine"),
+        (GOOD.replace('"xla"', '"mujco"'), "", "unknown engine 'mujco'; did you mean 'mujoco'?"),
+        (GOOD.replace('"xla"', '"gpu"'), "", "unknown engine 'gpu'; known: xla, fused, mjx, mujoco, warp"),
+        (GOOD.replace('"xla"', '"mujoco"'), "", "it has engine = 'mujoco', but no step calls an engine; a task that"),
         (GOOD.replace("obs_dim=3", "obs_dim=4"), "", "reset gives obs of shape (2, 3), but its spec says (2, 4)"),
         (GOOD.replace("> 2.0, ", ", "), "", "terminated must be a bool, not float32"),
         (
@@ -146,6 +149,6 @@ def test_files_that_cannot_be_used(text: str | None, name: str, says: str, tmp_p
 def test_a_factory_takes_options(tmp_path: pathlib.Path):
     file = tmp_path / "env.py"
     file.write_text(GOOD + "\n\ndef wide(engine='xla'):\n    env = Pole()\n    env.engine = engine\n    return env\n")
-    assert envs.make(f"{file}:wide", engine="mine").engine == "mine"
+    assert envs.make(f"{file}:wide", engine="mjx").engine == "mjx"
     with pytest.raises(envs.TaskError, match="has no option 'engin'; did you mean 'engine'"):
-        envs.make(f"{file}:wide", engin="mine")
+        envs.make(f"{file}:wide", engin="mjx")

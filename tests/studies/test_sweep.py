@@ -270,7 +270,7 @@ def test_reproduce_a_whole_table_at_the_smoke_budget(tmp_path: pathlib.Path, cli
             ["--set", "hidden=64,64"],
             "hidden has the value 64 twice; name each once; one list of them goes into brackets",
         ),
-        ([], "nothing varies: give --set NAME=VALUE,..., or a TOML file with a [sweep] table"),
+        ([], "nothing varies: give --set NAME=VALUE,..., or a TOML file with a [[sweep]] table"),
         (["--set", "clip=0.1:0.2"], "clip has a range: add --random N, the number of values to draw"),
         (["--set", "clip=0.1,0.2", "--random", "3"], "random draws need a range"),
         (["--set", "clip=0.2:0.1", "--random", "3"], "a range is LOW:HIGH with LOW below HIGH"),
@@ -366,9 +366,9 @@ def test_a_part_extends_a_file_next_to_its_own(file: str, tmp_path: pathlib.Path
     ("text", "says"),
     [
         ('task = "lane"', "nothing varies"),
-        ("sweep = 3", "has no [sweep] table"),
+        ("sweep = 3", "has no [[sweep]] table"),
         ('[sweep]\nextends = "lane"\nset = 3', "set must be a table of settings"),
-        ('[sweep]\nextends = "lane"\nrandom = 1.5', "random must be a whole number, not 1.5"),
+        ('[sweep]\nextends = "lane"\nrandom = 1.5', "random must be a whole number of at least 1, not 1.5"),
         ('[sweep]\nextends = "lane"\nclpi = 0.1', "unknown setting 'clpi'; did you mean 'clip'?"),
         (
             'task = "lane"\n[sweep]\nextends = "noisy"',

@@ -137,7 +137,8 @@ def test_the_papers_numbers_stand_beside_ours_in_every_format(tmp_path: pathlib.
     assert "CR" in text and "PL" not in text.splitlines()[0]
     target = tmp_path / "table.md"
     code, out, _ = cli("table", tmp_path, "--format", "markdown", "-o", target)
-    assert code == 0 and not out
+    assert code == 0 and out == f"wrote {target}\n"
+    assert cli("table", tmp_path, "--format", "json", "-o", "/dev/null")[1] == ""
     lines = target.read_text().splitlines()
     assert lines[1] == "|---" * (lines[0].count("|") - 1) + "|" and "| 2880.68 ± 106.21 | 4.02 ± 1.46 |" in lines[2]
     latex = cli("table", tmp_path, "--format", "latex")[1]
