@@ -16,11 +16,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from envs import native
 from envs.ant import corridor, walls
 from envs.multi_goal import models as goals
 from envs.physics.fused import model as tables_of
 from envs.velocity import robots
 
+compiled = pytest.mark.skipif(native.obstacle("fused") is not None, reason="no C++ compiler here")
 ROBOTS = ("corridor", "hopper", "walls", "swimmer", "humanoid", "ant", "half_cheetah", "walker2d")
 FULL = ("hopper", "walls", "humanoid")  # a planar robot, the corridor's ant next to solid walls, the largest robot
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs import native
-from native import compiled
 from pmt_jax import load_config, tasks
 from pmt_jax.learning import fused, learner
 from pmt_jax.learning.maths import gru
 from pmt_jax.learning.networks import MLP
 from pmt_jax.learning.optimise import fit, init_train_state
+from stepping import compiled
 
 pytestmark = compiled
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import envs
 from envs.ant import corridor, walls
 from envs.errors import TaskError
-from native import compiled
 from paths import DATA
+from stepping import compiled
 
 TOLERANCE = {"qpos": 5e-5, "qvel": 5e-3, "reward_contact": 1e-5, "reward": 2e-3, "torso_xpos": 5e-5}
 # Here the ant stands inside a wall, which turns it at 1e-3 rad/s for the control step. Ours are drawn only.

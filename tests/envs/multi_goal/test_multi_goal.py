@@ -23,8 +23,8 @@ from envs.multi_goal.multi_goal import KINDS, VASE_HEIGHT
 from envs.multi_goal.scene import HAZARD_COLOUR
 from envs.multi_goal.sensing import SENSORS
 from envs.physics import PhysicsState
-from native import compiled
 from paths import DATA
+from stepping import compiled
 
 NAMES = [f"multi_goal_{variant}" for variant in VARIANTS]
 # Both robots, hazards, vases with and without a cost, slots, on the engine that compiles nothing; by default, the ant.

@@ -20,9 +20,8 @@ from envs.errors import TaskError
 from envs.hands import hand_over
 from envs.physics import contract, mjx_patches, thread_team, warp_engine
 from envs.physics.fused import nvrtc
-from native import compiled
 from paths import ROOT
-from stepping import assert_batches_agree, assert_same
+from stepping import assert_batches_agree, assert_same, compiled
 
 READOUT = {"torso": ("xpos", 1), "forces": ("cfrc_ext", slice(None))}
 PLAIN = {"torso": ("xpos", 1), "motors": ("qfrc_actuator", slice(6, 14, 2))}

@@ -29,7 +29,6 @@ from envs.physics.fused import model as tables_of
 from envs.physics.fused.header import header
 from envs.physics.fused_engine import FusedEngine
 from envs.velocity import robots
-from native import compiled
 from paths import ROOT
 from pmt_jax import tasks
 from stepping import (
@@ -40,6 +39,7 @@ from stepping import (
     by_c,
     by_robot,
     check,
+    compiled,
     crowded,
     exact,
     kinds,

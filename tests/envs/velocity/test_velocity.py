@@ -14,8 +14,8 @@ import envs
 from envs.errors import TaskError
 from envs.vector import VectorEnv
 from envs.velocity import VARIANTS, robots
-from native import compiled
 from paths import DATA
+from stepping import compiled
 
 NAMES = [f"velocity_{variant}" for variant in VARIANTS]
 PLACES = ("torso_xpos", "com")  # what `restore` takes next to qpos, of the robots that have it
