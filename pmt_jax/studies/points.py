@@ -88,13 +88,13 @@ def make_points(parts: Sequence[Part], preset: str = "default", **fixed: Any) ->
 
 
 def _check_seeds(points: Points) -> None:
-    """Raises UsageError if two points that differ in their first seed alone have a seed in common."""
+    """Raises UsageError if two points that differ in their seeds alone have one in common."""
     alike: dict[str, list[tuple[int, str]]] = {}
     for name, config in points.items():
-        alike.setdefault(repr(config.replace(seed=0)), []).append((config.seed, name))
+        alike.setdefault(repr(config.replace(seed=0, seeds=1)), []).append((config.seed, name))
     for found in alike.values():
         for (seed, name), (after, other) in itertools.pairwise(sorted(found)):
-            if seed < after < seed + points[name].seeds:
+            if seed <= after < seed + points[name].seeds:
                 raise UsageError(
                     f"points '{name}' and '{other}' would both train seed {after}: with seeds = {points[name].seeds} "
                     "their first seeds must be as far apart, or ask for fewer seeds"

@@ -265,6 +265,7 @@ def test_reproduce_a_whole_table_at_the_smoke_budget(tmp_path: pathlib.Path, cli
         (["--set", "clip=0.1,wide"], "clip = 'wide' does not fit: expected a number"),
         (["--set", "method=happo,hapo"], "unknown method 'hapo'; did you mean 'happo'?"),
         (["--set", "task=lane,noisy"], "--set has one task"),
+        (["--set", "seeds=1,2"], "points 'seeds=1' and 'seeds=2' would both train seed 0"),
         (["--set", "clip=0.1,0.10"], "clip has the value 0.1 twice; name each once"),
         (
             ["--set", "hidden=64,64"],
