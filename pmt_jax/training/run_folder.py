@@ -123,11 +123,11 @@ class RunFolder:
             edited = saved.provenance.unexplained(saved.step, written, self._changes)
             self._run = Provenance(saved.provenance.config if edited else written, saved.provenance.trials)
         check_settings(self.path, self._run, self._provenance, edited, change, self._say)
-        asked = self._setup.config.num_updates * self._setup.config.batch_size
-        if saved and saved.step > asked:
+        planned, asked = (x.num_updates * x.batch_size for x in (self._run.config, self._setup.config))
+        if saved and asked < saved.step < planned:  # of a run that has ended, nothing is left to train
             raise UsageError(
-                f"the run in {self.path} has {saved.step:,} steps already, more than the {asked:,} asked for; --steps "
-                f"may only grow: ask for {saved.step} or more, or leave it out"
+                f"the run in {self.path} has {saved.step:,} of {planned:,} steps already, more than the {asked:,} asked"
+                f" for; ask for {saved.step} or more, or leave --steps out"
             )
         self._is_edited = bool(edited)
         check_machine(self.path, self._setup.config.physics, versions(self._setup), self._say)
