@@ -252,7 +252,7 @@ def test_two_processes_train_what_one_trains(tmp_path: pathlib.Path, cli):
     [
         (("--devices", 2), "--devices 2, but JAX sees 1 cpu device(s); take at most 1; XLA_FLAGS=--xla_force_host_"),
         (("--devices", "many"), "--devices must be a whole number of at least 1, not 'many'"),
-        (("--process", 0), "belong together; --coordinator and --processes is missing"),
+        (("--process", 0), "belong together; --coordinator and --processes are missing"),
         (
             ("--coordinator", "node1", "--process", 0, "--processes", 2),
             "must be HOST:PORT, like node1:1234, not 'node1'",
