@@ -205,14 +205,8 @@ class Config(Hyper):
         return -(-self.steps // self.batch_size)
 
     def replace(self, **changes: Any) -> Config:
-        """A copy with some fields changed, which are read as keywords of `load_config` are.
-
-        Raises:
-          UsageError: an unknown field, or a value that does not fit.
-        """
-        from .load import convert  # which needs this module
-
-        return dataclasses.replace(self, **{name: convert(name, value) for name, value in changes.items()})
+        """A copy with some fields changed, whose bounds are checked like a new one's; values need the fields' types."""
+        return dataclasses.replace(self, **changes)
 
 
 FIELDS: dict[str, Any] = typing.get_type_hints(Config)

@@ -113,24 +113,6 @@ def test_bad_values_get_a_sentence(changes: dict[str, object], says: str):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"num_envs": "many"}, "num_envs = 'many' does not fit"),
-        ({"seeds": 2.5}, "seeds = 2.5 does not fit"),
-        ({"foo": 3}, "unknown setting 'foo'"),
-    ],
-)
-def test_a_copy_reads_its_changes_as_a_new_one_does(changes: dict[str, object], says: str):
-    config = load_config("lane")
-    with pytest.raises(UsageError) as error:
-        config.replace(**changes)
-    assert says in str(error.value)
-    copied = config.replace(num_envs="48", hidden=[8, 8], cost_limit=[1, 2], env={"num_agents": 3})
-    assert (copied.num_envs, copied.hidden, copied.cost_limit) == (48, (8, 8), (1.0, 2.0))
-    assert copied == load_config("lane", num_envs=48, hidden=[8, 8], cost_limit=[1, 2], env={"num_agents": 3})
-
-
-@pytest.mark.parametrize(
     ("text", "says"),
     [
         ("task = ", "is not valid TOML"),
