@@ -13,6 +13,7 @@ import inspect
 import pathlib
 import re
 import sys
+import sysconfig
 import traceback
 import types
 from collections.abc import Callable
@@ -103,7 +104,7 @@ def _module(file: pathlib.Path, changed: int) -> types.ModuleType:
     assert spec and spec.loader  # a .py file has both
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
-    _guard(f"{file} cannot be imported", lambda: spec.loader.exec_module(module))  # pyright: ignore[reportOptionalMemberAccess]
+    guard(f"{file} cannot be imported", lambda: spec.loader.exec_module(module))  # pyright: ignore[reportOptionalMemberAccess]
     return module
 
 
@@ -113,7 +114,7 @@ def build(make: Callable[..., Any], name: str, options: dict[str, Any]) -> Env:
     Raises:
       TaskError: it fails, lacks something, or returns other shapes than its spec promises.
     """
-    env = _guard(f"{name} cannot be built", lambda: make(**options))
+    env = guard(f"{name} cannot be built", lambda: make(**options))
     missing = [need for need in NEEDS if not hasattr(env, need)]
     if missing:
         raise TaskError(f"{name} does not keep the contract of envs/base.py: it has no {', '.join(missing)}")
@@ -138,10 +139,10 @@ def check_shapes(env: Env, name: str) -> None:
     spec = getattr(env, "spec", None)
     if not isinstance(spec, EnvSpec):
         raise TaskError(f"{name}: spec must be an EnvSpec of envs/base.py, not a {type(spec).__name__}")
-    start = _guard(f"{name}: reset fails", lambda: jax.eval_shape(env.reset, jax.random.key(0)))
+    start = guard(f"{name}: reset fails", lambda: jax.eval_shape(env.reset, jax.random.key(0)))
     _check_fields(env.spec, start, name)
     action = jnp.zeros(env.spec.action_mask.shape)
-    after = _guard(f"{name}: step fails", lambda: jax.eval_shape(env.step, start, action))
+    after = guard(f"{name}: step fails", lambda: jax.eval_shape(env.step, start, action))
     before, then = (dict(jax.tree_util.tree_leaves_with_path(x)) for x in (start, after))
     for path in {**before, **then}:
         old, new = (f"{x[path].dtype}{list(x[path].shape)}" if path in x else "nothing" for x in (before, then))
@@ -223,7 +224,7 @@ def _check_values(env: Env, name: str) -> None:
         later = jax.lax.scan(step, start, jnp.stack([0 * mask, mask, apart]))[1]
         return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), seen(start), later)
 
-    found = _guard(f"{name}: the first steps fail", lambda: jax.device_get(jax.jit(play)(jax.random.key(0))))
+    found = guard(f"{name}: the first steps fail", lambda: jax.device_get(jax.jit(play)(jax.random.key(0))))
     for field, values in found.items():
         if not np.isfinite(values).all():
             step = int(np.argwhere(~np.isfinite(values))[0][0])
@@ -236,14 +237,19 @@ def _check_values(env: Env, name: str) -> None:
         raise TaskError(f"{name}: it has shares_cost = True, but its agents' costs differ; leave shares_cost out")
 
 
-def _guard(what: str, run: Callable[[], Any]) -> Any:
-    """Runs code of the user's and turns what it raises into one sentence with its line."""
+def guard(what: str, run: Callable[[], Any]) -> Any:
+    """What code of the user's returns.
+
+    Raises:
+      TaskError: in one sentence with the user's line, whatever the code raised.
+    """
     try:
         return run()
     except (Exception, SystemExit) as error:  # a user's file may raise anything
         lines = traceback.extract_tb(error.__traceback__)
-        ours = (str(pathlib.Path(__file__).parent), "<")  # <string> is a dataclass
-        own = [line for line in lines if not line.filename.startswith(ours)]
+        # Neither ours nor of a package that the user's code calls, as JAX; <string> is a dataclass.
+        others = (str(pathlib.Path(__file__).parent), "<", sysconfig.get_path("purelib"), sysconfig.get_path("platlib"))
+        own = [line for line in lines if not line.filename.startswith(others)]
         line = (own or lines)[-1]
         place = f"{pathlib.Path(line.filename).name}, line {line.lineno}"
         if isinstance(error, TaskError):

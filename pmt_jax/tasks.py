@@ -34,6 +34,7 @@ __all__ = [
     "did_you_mean",
     "engines",
     "explain_options",
+    "guard",
     "installed_version",
     "observed_cost",
     "is_file",
@@ -107,6 +108,16 @@ def members(name: str) -> tuple[dict[str, Any], str | None]:
     """
     with _asked() as envs:
         return envs.user.members(name)
+
+
+def guard(what: str, run: Callable[[], Any]) -> Any:
+    """What code of the user's returns.
+
+    Raises:
+      UsageError: `what` happened, and why, in one sentence with the user's line.
+    """
+    with _asked() as envs:
+        return envs.user.guard(what, run)
 
 
 def absolute(name: str) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import pathlib
-import traceback
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
+from .. import tasks
 from ..errors import UsageError
 from .maths.losses import appraisal_loss, cross_entropy
 from .optimise import fit
@@ -67,13 +66,7 @@ def own_signal(signal: Callable[[Batch], jax.Array], batch: Batch) -> jax.Array:
       UsageError: it fails, or returns something else.
     """
     name = f"the method's cost_signal {getattr(signal, '__name__', '')}".strip()
-    try:
-        found = jnp.asarray(signal(batch))
-    except Exception as error:  # a user's function may raise anything
-        *_, last = traceback.extract_tb(error.__traceback__)[:2]  # this function, then the user's
-        first = (str(error).splitlines() or [""])[0]
-        place = f"{pathlib.Path(last.filename).name}, line {last.lineno}"
-        raise UsageError(f"{name} fails: {type(error).__name__}: {first} ({place})") from error
+    found = tasks.guard(f"{name} fails", lambda: jnp.asarray(signal(batch)))
     if found.shape != batch.cost.shape:
         raise UsageError(f"{name} must return an array [T, B, N, K], here {batch.cost.shape}, not {found.shape}")
     return found

@@ -138,6 +138,7 @@ def test_mistakes_are_one_sentence(
     ("returned", "said"),
     [
         ("batch.costs", "cost_signal harm fails: AttributeError: 'Batch' object has no attribute 'costs'"),
+        ("batch.cost.reshape(7, 7)", "cost_signal harm fails: TypeError: cannot reshape array"),
         ("batch.cost[..., 0]", "must return an array [T, B, N, K], here (25, 4, 2, 1), not (25, 4, 2)"),
     ],
 )
