@@ -204,6 +204,11 @@ class Config(Hyper):
         """Updates that cover `steps`."""
         return -(-self.steps // self.batch_size)
 
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of a seed: `steps`, rounded up to whole updates."""
+        return self.num_updates * self.batch_size
+
     def replace(self, **changes: Any) -> Config:
         """A copy with some fields changed, whose bounds are checked like a new one's; values need the fields' types."""
         return dataclasses.replace(self, **changes)

@@ -43,7 +43,7 @@ def row_steps(config: Config, changes: Sequence[Row], until: int) -> Iterator[in
     found = [(row["step"], row["changed"]["log_interval"].split(" -> ")) for row in changes if _has_interval(row)]
     ends = [*(min(step, until) for step, _ in found), until]
     intervals = [*(int(old) for _, (old, _) in found), config.log_interval]
-    begin, last = 0, config.num_updates * config.batch_size
+    begin, last = 0, config.total_steps
     for end, interval in zip(ends, intervals, strict=True):
         row = interval * config.batch_size
         yield from range((begin // row + 1) * row, end + 1, row)

@@ -99,7 +99,7 @@ class Trainer:
         self.step, self.seconds = 0, 0.0
         self.broken: dict[int, str] = {}
         self.faults: collections.Counter[str] = collections.Counter()
-        self.total = self.config.num_updates * self.config.batch_size
+        self.total = self.config.total_steps
         self._row, self._row_start, self._row_updates = chunks.OpenRow(), state, 0
         self._speed: float | None = None  # seconds that an update took in the last chunk
         self._busy = threading.Lock()  # held by whoever may change or save what is below, except while programs run

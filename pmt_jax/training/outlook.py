@@ -21,7 +21,7 @@ LITTLE = 1.5  # times what it began as: a multiplier that grows by less has hard
 def describe(setup: Setup, out: pathlib.Path, say: Say) -> None:
     """Prints what will be trained, with what, into which run folder, and the `notes` about it."""
     config, device = setup.config, jax.devices()[0]
-    steps = config.num_updates * config.batch_size
+    steps = config.total_steps
     threads = f", {len(os.sched_getaffinity(0))} CPUs" if hasattr(os, "sched_getaffinity") else ""
     seeds = f"{config.seeds} seed(s) from {config.seed}"
     if setup.trials:

@@ -123,7 +123,7 @@ class RunFolder:
             edited = saved.provenance.unexplained(saved.step, written, self._changes)
             self._run = Provenance(saved.provenance.config if edited else written, saved.provenance.trials)
         check_settings(self.path, self._run, self._provenance, edited, change, self._say)
-        planned, asked = (x.num_updates * x.batch_size for x in (self._run.config, self._setup.config))
+        planned, asked = (made.config.total_steps for made in (self._run, self._provenance))
         if saved and asked < saved.step < planned:  # of a run that has ended, nothing is left to train
             raise UsageError(
                 f"the run in {self.path} has {saved.step:,} of {planned:,} steps already, more than the {asked:,} asked"
