@@ -27,8 +27,8 @@ def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
         raise UsageError(f"cannot write {out}: it is a folder; choose another {flag}")
     partial = out.with_stem(f".{out.stem}.partial")
     try:
-        if out.exists() and not out.is_file() and not out.is_dir():
-            yield out  # a device or a pipe, as /dev/stdout, is written and never replaced
+        if _is_stream(out):
+            yield out  # is written and never replaced
             return
         out.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -40,15 +40,18 @@ def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
             partial.unlink(missing_ok=True)
 
 
+def _is_stream(out: pathlib.Path) -> bool:
+    """Whether `out` is a device or a pipe, as /dev/stdout."""
+    return os.path.exists(out) and not os.path.isfile(out) and not os.path.isdir(out)
+
+
 def check_writable(out: pathlib.Path, flag: str = "-o") -> None:
     """Refuses early what `writing` would refuse after the work.
 
     Raises:
       UsageError: `out` is a folder, or the nearest folder that is there cannot be written.
     """
-    there = next((path for path in out.parents if os.path.exists(path)), out)
-    if os.path.exists(out) and not os.path.isfile(out) and not os.path.isdir(out):
-        there = out  # a device or a pipe, as /dev/stdout
+    there = out if _is_stream(out) else next((path for path in out.parents if os.path.exists(path)), out)
     if os.path.isdir(out):
         reason = "it is a folder"
     elif os.path.isfile(there):

@@ -112,7 +112,6 @@ def policy_function(setup: Setup, state: ActingState) -> Policy:
     """
     mask = jnp.asarray(setup.vector.spec.action_mask)
     memory = setup.nets.start(1)
-
     expected = (setup.vector.spec.num_agents, setup.vector.spec.obs_dim)
 
     def act(obs: jax.Array, hidden: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
