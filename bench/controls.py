@@ -53,9 +53,8 @@ def appraise_fear(setup: Any, hyper: Any, now: Any, net: Any, batch: Any, *rest:
     """As `fear.appraise_fear`, by the loss of the method; keeps the costs for `gae`."""
     method = setup.method
     _traced["method"], _traced["cost"] = method, constraint.in_unit(setup, hyper, batch.cost)
-    if not (isinstance(method, Control) and method.squared_loss):
-        return _appraise(setup, hyper, now, net, batch, *rest)
-    with mock.patch.object(fear, "cross_entropy", squared_error):
+    squares = isinstance(method, Control) and method.squared_loss
+    with mock.patch.object(fear, "cross_entropy", squared_error if squares else fear.cross_entropy):
         return _appraise(setup, hyper, now, net, batch, *rest)
 
 

@@ -107,19 +107,18 @@ def as_controls(files: pathlib.Path) -> str:
     scores = {name: _until(run, end) for name, run in found.items()}
     tested = [(name, other) for name in CONTROLS for other in PAIR if name not in (other, PAIR[0])]
     p = holm([welch_test(scores[name]["training"], scores[other]["training"]) for name, other in tested])
-    corrected = dict(zip(tested, p, strict=True))
+    against = {}
+    for (name, other), corrected in zip(tested, p, strict=True):
+        difference = _difference(scores[name]["training"], scores[other]["training"])
+        against[name, other] = f"{difference}, {p_value(corrected)}"
     body = []
     for name, words in CONTROLS.items():
         own, limit = scores[name], _limit(found[name])
-        line = [words, mean_sd(own["training"])]
-        for other in reversed(PAIR):
-            p = corrected.get((name, other))
-            difference = _difference(own["training"], scores[other]["training"])
-            line.append("-" if p is None else f"{difference}, {p_value(p)}")
+        line = [words, mean_sd(own["training"]), *(against.get((name, other), "-") for other in reversed(PAIR))]
         line += [mean_sd(own["end"]), mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {own['end'].size}"]
         body.append(line)
-    against = [f"less {NAMES[other]}'s [95 %], d, p" for other in reversed(PAIR)]
-    return markdown(["", "harm, of 1,000 steps", *against, "true cost at the end", "reward", "seeds beyond"], body)
+    less = [f"less {NAMES[other]}'s [95 %], d, p" for other in reversed(PAIR)]
+    return markdown(["", "harm, of 1,000 steps", *less, "true cost at the end", "reward", "seeds beyond"], body)
 
 
 def as_equivalence(files: pathlib.Path) -> str:
