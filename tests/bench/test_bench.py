@@ -352,7 +352,7 @@ def test_rendering_fills_numbers_in_sentences():
     mark = "within:laptop_ant_2x4:f4sg:{}"
     text = f"kept by <!-- bench: {mark.format('1:ant_2x4')} -->9<!-- /bench --> of 10"
     assert "-->3<!-- /bench --> of 10" in render.render(text, {})
-    assert values.number(mark.format("*")) == "10"
+    assert values.number(mark.format("*")) == "20"
     assert values.number(mark.format("1").replace("within", "seeds")) == "10"
     both = "within:table1_ant_2x4_h200+recipe_ant_2x4_h200:f4sg+mappo_l:*"
     assert values.number(both) == "70" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
