@@ -406,9 +406,7 @@ def test_a_policy_in_parts_has_the_same_outputs_and_products():
         return jnp.tanh(obs @ flat[:6].reshape(3, 2)), jnp.exp(flat[6:])
 
     whole, cut = (jax.linearize(in_parts(policy, obs, parts), weights) for parts in (1, 4))
-    for ours, theirs in zip(cut[0], whole[0], strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
-    for ours, theirs in zip(cut[1](step), whole[1](step), strict=True):
+    for ours, theirs in zip([*cut[0], *cut[1](step)], [*whole[0], *whole[1](step)], strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
     pulled = [jax.linear_transpose(push, weights)(whole[1](step))[0] for _, push in (whole, cut)]
     np.testing.assert_allclose(pulled[1], pulled[0], rtol=1e-5, atol=1e-5)
