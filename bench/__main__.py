@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from pmt_jax.cli import end
 from pmt_jax.cli.parser import Parser, command, refuse_unknown, whole
 from pmt_jax.cli.process import answer
 from pmt_jax.studies import plot
@@ -146,4 +147,4 @@ def _publish(arguments: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

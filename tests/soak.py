@@ -21,11 +21,11 @@ KINDS = (signal.SIGKILL, "closed pipe", "full disk", signal.SIGTERM, signal.SIGH
 SAVES_EVERY_ROW = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where tests run in the background
-from pmt_jax.cli import main
+from pmt_jax.cli import run
 from pmt_jax.training import loop
 loop.CHECKPOINT_SECONDS = 0.0
 signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.exit(main(sys.argv[1:]))
+run(sys.argv[1:])
 """
 
 

@@ -134,7 +134,7 @@ def test_every_command_that_compiles_says_so(command: tuple[object, ...], tmp_pa
 )
 def test_variables_that_a_process_starts_with(variable: str, command: str, says: str, tmp_path: pathlib.Path):
     name, _, value = variable.partition("=")
-    code = "import sys; from pmt_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from pmt_jax.cli import run; run(sys.argv[1:])"
     started = subprocess.run(
         [sys.executable, "-c", code, *command.split()],
         env=environment() | {name: value},
@@ -180,9 +180,9 @@ def test_a_system_without_locks_trains_nothing_and_doctor_says_so(cli, monkeypat
 def test_a_process_without_locks_starts_and_evaluates():
     """Nothing but training imports them."""
     code = (
-        "import sys; sys.modules['fcntl'] = None; from pmt_jax.cli import main\n"
+        "import sys; sys.modules['fcntl'] = None; from pmt_jax.cli import run\n"
         "import pmt_jax.policies.evaluate, pmt_jax.policies.export, pmt_jax.render.film, pmt_jax.render.report\n"
-        "sys.exit(main(['train', 'lane']))"
+        "run(['train', 'lane'])"
     )
     done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True)
     assert done.returncode == 2 and "fcntl" in done.stderr.splitlines()[-1]  # JAX may have warned of its cache before

@@ -79,8 +79,8 @@ class Interrupt:
             except KeyboardInterrupt as interrupt:
                 {then}
 sys.meta_path.insert(0, Interrupt())
-from pmt_jax.cli import main
-sys.exit(main(["train", "lane"]))
+from pmt_jax.cli import run
+run(["train", "lane"])
 """
 
 
@@ -106,7 +106,7 @@ def test_the_handler_goes_with_the_command(cli):
 # Names and texts are UTF-8 whatever the locale says; what cannot be is one sentence
 
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-MAIN = "import sys; from pmt_jax.cli import main; sys.exit(main())"
+MAIN = "import sys; from pmt_jax.cli import run; run()"
 NAME = "r\u00fcn".encode()
 
 
@@ -124,7 +124,7 @@ def test_every_locale_is_taken_for_utf8(whole: pathlib.Path, tmp_path: pathlib.P
     page = (tmp_path / "\u00fc.html").read_text(encoding="utf-8")
     assert "<h3>Evaluation</h3>" in page and "<h3>An episode</h3>" in page and "<h2>r\u00fcn</h2>" in page
     # Where another program has started Python and calls `main`, it can only say so.
-    called = in_ascii(tmp_path, "-c", MAIN.replace("main()", "main(['eval', sys.argv[1]])"), NAME)
+    called = in_ascii(tmp_path, "-c", MAIN.replace("run()", "run(['eval', sys.argv[1]])"), NAME)
     assert called.returncode == 2 and "set PYTHONUTF8=1" in called.stderr and called.stderr.count("\n") == 1
 
 

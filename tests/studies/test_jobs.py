@@ -181,7 +181,7 @@ def test_a_share_that_died_is_taken_up_by_the_next_call(tmp_path: pathlib.Path, 
     assert code == 143 and "interrupted" in text and not finished(out)
     assert len(run_log.read_all([out], lambda _: None)) == 1  # `pmt table` shows how far it is
     with acquire(out / ".group-1"):
-        script = "import sys; from pmt_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+        script = "import sys; from pmt_jax.cli import run; run(sys.argv[1:])"
         words = [str(word) for word in (*SWEEP, out, "--part", "2/3")]
         held = subprocess.run([sys.executable, "-c", script, *words], env=environment(), capture_output=True, text=True)
     assert held.returncode == 0 and "left to the process that trains it" in held.stdout, held.stderr

@@ -23,7 +23,7 @@ from runs import ARGUMENTS, STEPS, assert_same_run, environment
 
 BUSY = """
 import hashlib, signal, sys
-from pmt_jax.cli import main
+from pmt_jax.cli import run
 from pmt_jax.training import trainer
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
@@ -40,7 +40,7 @@ def compile_slowly(setup, say):
     return state, programs._replace(chunk=in_native_code)
 
 trainer.compile_run = compile_slowly
-sys.exit(main(sys.argv[2:]))
+run(sys.argv[2:])
 """
 
 
@@ -101,7 +101,7 @@ def test_a_closed_pipe_silences_the_output_and_training_continues(whole: pathlib
 
 LONG_UPDATE = """
 import hashlib, signal, sys, threading
-from pmt_jax.cli import main
+from pmt_jax.cli import run
 from pmt_jax.training import signals, trainer
 
 signals.PATIENCE = 0.0
@@ -121,7 +121,7 @@ def compile_slowly(setup, say):
     return state, programs._replace(chunk=chunk)
 
 trainer.compile_run = compile_slowly
-sys.exit(main(sys.argv[1:]))
+run(sys.argv[1:])
 """
 
 
