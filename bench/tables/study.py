@@ -19,14 +19,16 @@ Scores = NDArray[np.float64]  # [seeds]
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 PAIR = ("mappo_l", "f4sg")
 EQUAL = {"reward": 2, "training": 10}  # bounds of equivalence, %
-CONTROLLED = "ant_2x4"
 CONTROLS = {  # labels of stored runs, in the order of the table
     "mappo_l": "MAPPO-L",
     "f4sg": "F4SG",
     "current": "F4SG with fear of the current state",
     "squared": "F4SG with squared errors",
     "target_only": "fear as target of the cost critic alone",
+    "mixed": "Mixed",
     "r4sg": "R4SG",
+    "mappo_pid": "MAPPO-L with a PID multiplier",
+    "macpo": "MACPO",
 }
 
 
@@ -98,21 +100,25 @@ def as_harm(files: pathlib.Path) -> str:
 
 
 def as_controls(files: pathlib.Path) -> str:
-    """What lacks a part of F4SG, or has one, against F4SG and against MAPPO-L: `ant_2x4`, until all have ended.
+    """What lacks a part of F4SG, or has one, and other methods, against F4SG and against MAPPO-L, until all have ended.
 
-    Holm corrects all tests of the table together. Files are joined by +.
+    Of the runs in files joined by +, those on the task of the first one that do not notice every costly step. Holm
+    corrects all tests of the table together.
     """
-    found = {run.get("label", run["method"]): run for run in runs.load(files) if run["task"] == CONTROLLED}
+    stored = runs.load(files)
+    compared = [run for run in stored if run["task"] == stored[0]["task"] and share(run) < 1]
+    found = {run.get("label", run["method"]): run for run in compared}
     end = min(run["steps"][-1] for run in found.values())
     scores = {name: _until(run, end) for name, run in found.items()}
-    tested = [(name, other) for name in CONTROLS for other in PAIR if name not in (other, PAIR[0])]
+    lines = {name: words for name, words in CONTROLS.items() if name in found}
+    tested = [(name, other) for name in lines for other in PAIR if name not in (other, PAIR[0])]
     p = holm([welch_test(scores[name]["training"], scores[other]["training"]) for name, other in tested])
     against = {}
     for (name, other), corrected in zip(tested, p, strict=True):
         difference = _difference(scores[name]["training"], scores[other]["training"])
         against[name, other] = f"{difference}, {p_value(corrected)}"
     body = []
-    for name, words in CONTROLS.items():
+    for name, words in lines.items():
         own, limit = scores[name], _limit(found[name])
         line = [words, mean_sd(own["training"]), *(against.get((name, other), "-") for other in reversed(PAIR))]
         line += [mean_sd(own["end"]), mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {own['end'].size}"]

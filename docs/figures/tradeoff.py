@@ -59,7 +59,7 @@ def _panel(panel: Any, found: list[runs.Run]) -> None:
     panel.set_xscale("symlog", linthresh=limit)
     panel.set_xticks(ticks := cost_ticks(limit, top), [f"{tick:g}" for tick in ticks])
     panel.set_xticks([], minor=True)
-    panel.set_xlim(-0.06 * limit, 1.2 * top)
+    panel.set_xlim(-0.06 * limit, 1.2 * max(top, limit))
     panel.axvline(limit, color=INK, ls="--", lw=1.2)
     panel.text(limit, 1.0, f"limit {limit:g} ", transform=panel.get_xaxis_transform(), color=INK, ha="right", va="top")
 
