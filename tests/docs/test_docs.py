@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import doctest
 import functools
@@ -163,6 +164,20 @@ def test_commands_in_markdown(path: pathlib.Path):
         source = getattr(arguments, "source", "")
         if arguments.command == "train" and source.removeprefix("paper/") in tasks.names():
             load_config(source, preset=arguments.preset, **flags.given(arguments))
+
+
+@pytest.mark.parametrize("path", pages("`pmt "))
+def test_flags_in_sentences(path: pathlib.Path):
+    """Commands within a sentence, which may have words to be replaced, are commands, and their flags are flags."""
+    parser, known = make_parser()
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    sentences = re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL)
+    for command in re.findall(r"`pmt ([^`]+)`", sentences):
+        words = shlex.split(command)
+        assert words[0] in known, command
+        flags = {flag for action in commands.choices[words[0]]._actions for flag in action.option_strings}
+        used = {word.split("=")[0] for word in words if re.match("--?[a-z]", word)}
+        assert used <= flags, (command, used - flags)
 
 
 @pytest.mark.parametrize("path", pages("python -m "))
