@@ -110,15 +110,19 @@ class RunLog:
 
     @property
     def excess(self) -> np.ndarray:
-        """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest.
+        """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest."""
+        name = "true_episode_cost" if self._judges_true_costs else "episode_cost"
+        return self.judged_limits.excess(self._costs(name))
 
-        If not all of one cost is observed (`cost_seen`), it is the true cost beyond the limit on true costs.
-        """
-        seen = self.settings.get("cost_seen", 1.0)
-        true = seen < 1 and len(self.limits.each) == 1
-        if true and "true_episode_cost" in self.metrics:
-            return self.limits.true(seen).excess(self._costs("true_episode_cost"))
-        return self.limits.excess(self._costs("episode_cost"))
+    @property
+    def judged_limits(self) -> Limits:
+        """The limits that `excess` is beyond: on true costs, where not all of one cost is observed (`cost_seen`)."""
+        return self.true_limits if self._judges_true_costs else self.limits
+
+    @property
+    def _judges_true_costs(self) -> bool:
+        several = len(self.limits.each) > 1
+        return self.settings.get("cost_seen", 1.0) < 1 and not several and "true_episode_cost" in self.metrics
 
     @property
     def true_limits(self) -> Limits:

@@ -13,6 +13,7 @@ from .run_log import RunLog, read
 NEAR = 2.0  # times the limit: costs beyond that are not near it
 FALLING = 0.05  # share by which costs fell between the last two tenths of the steps, if they still fall
 AT_BOUND = 0.98  # share of lambda_max
+MOST_PARTS = 5  # of a list of seeds
 
 
 def lines(folder: pathlib.Path) -> list[str]:
@@ -40,7 +41,8 @@ def _kept(log: RunLog, by_training: np.ndarray, by_mean: np.ndarray | None) -> s
     parts = [f"unknown {where}, as no episode ended" if unknown else f"kept {_count(by_training, where)}"]
     if by_mean is not None:
         parts.append(("kept " if unknown else "") + _count(by_mean, "under mean actions"))
-    return f"limit {log.limits}: {'; '.join(parts)}"
+    true = " on true costs" if log.judged_limits != log.limits else ""
+    return f"limit {log.judged_limits}{true}: {'; '.join(parts)}"
 
 
 def _count(excess: np.ndarray, where: str) -> str:
@@ -51,25 +53,34 @@ def _count(excess: np.ndarray, where: str) -> str:
 
 
 def _advice(log: RunLog, beyond: Sequence[int]) -> str:
-    """The first reason that applies to a seed beyond the limit, and what to do."""
+    """The first reason that applies to seeds `beyond` the limit, which these are, and what to do."""
     constraint = _constraint(log)
     if constraint == "none":
         return f"{log.method} has no constraint; train one that has: --method mappo_l or f4sg"
-    limit, seeds = log.limits.total, ", ".join(str(log.seeds[i]) for i in beyond)
-    whose = f"seed{'s' * (len(beyond) > 1)} {seeds}"
+    limit, seeds = log.limits.total, np.array(log.seeds)[beyond]
     bound = log.settings.get("lambda_max", np.inf)
-    if constraint == "lagrangian" and (_multiplier(log)[beyond] >= AT_BOUND * bound).any():
-        return f"{whose}: the multiplier is at its bound, lambda_max = {bound:g}; raise --lambda-max"
     cost = log.metrics["episode_cost"][beyond]
     before, last = (_mean(cost, log.steps, begin) for begin in (0.8, 0.9))
-    if np.any(before - last > FALLING * np.abs(before)):
+    held = (_multiplier(log)[beyond] >= AT_BOUND * bound) & (constraint == "lagrangian")
+    if held.any():
+        return f"{_named(seeds[held])}: the multiplier is at its bound, lambda_max = {bound:g}; raise --lambda-max"
+    falling = before - last > FALLING * np.abs(before)
+    if falling.any():
         more = f"--steps {2 * int(log.steps[-1]):g} --out {log.folder} --resume"
-        return (
-            f"{whose}: costs were still falling ({np.nanmean(before):.3g} to {np.nanmean(last):.3g}); train on: {more}"
-        )
-    if (last > NEAR * limit).any():
-        return _far(cost[last > NEAR * limit], whose, limit, constraint)
-    return f"{whose}: costs stay about the limit; a higher --cost-margin holds them below it"
+        fell = f"costs were still falling ({before[falling].mean():.3g} to {last[falling].mean():.3g})"
+        return f"{_named(seeds[falling])}: {fell}; train on: {more}"
+    far = last > NEAR * limit
+    if far.any():
+        return _far(cost[far], _named(seeds[far]), limit, constraint)
+    return f"{_named(seeds)}: costs stay about the limit; a higher --cost-margin holds them below it"
+
+
+def _named(seeds: np.ndarray) -> str:
+    """Seeds [S] in order, "seeds 3, 5 to 9", shortened where they are many."""
+    runs = np.split(seeds, np.flatnonzero(np.diff(seeds) > 1) + 1)
+    parts = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    many = f" and others, {len(seeds)} in all" if len(parts) > MOST_PARTS else ""
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(parts[:MOST_PARTS])}{many}"
 
 
 def _far(cost: np.ndarray, whose: str, limit: float, constraint: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import signal
@@ -125,6 +126,17 @@ CASES = {
     ),
     "one far, one near": (log_of([FLAT, FLAT + 4]), "0 of 2", "costs never came near the limit (lowest row 5.3)"),
     "about the limit": (log_of([FLAT]), "0 of 1", "--cost-margin"),
+    "some falling": (
+        log_of([FLAT, np.linspace(5, 1.2, 20), FLAT]),
+        "0 of 3",
+        "seed 1: costs were still falling (1.7 to 1.3);",
+    ),
+    "many": (
+        log_of([FLAT - x for x in [0] * 4 + [1, 0, 0, 1] * 6]),
+        "kept by 12 of 28",
+        " and others, 16 in all: costs",
+    ),
+    "in a row": (log_of([FLAT - x for x in (0, 0, 0, 1, 0, 0, 1, 0)]), "2 of 8", "seeds 0 to 2, 4, 5, 7: costs stay"),
     "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
     "trust region": (log_of([FLAT + 4], method="macpo"), "0 of 1", "raise --limit-lr"),
     "by its noise": (log_of([FLAT], deployed=[0.2]), "; by 1 of 1 seed under mean actions", "keeps the limit"),
@@ -146,14 +158,21 @@ def test_what_the_end_says_of_a_limit(case: str, monkeypatch: pytest.MonkeyPatch
     assert (len(said) == 1) if advice is None else any(advice in line for line in said)
 
 
+def test_the_limit_is_that_of_true_costs_where_they_are_judged(monkeypatch: pytest.MonkeyPatch):
+    """A tenth of the costs is noticed: 0.13 of a limit of 0.1 are 1.3 of 1."""
+    log = log_of([0.1 * FLAT], limit=0.1, cost_seen=0.1)
+    log = dataclasses.replace(log, metrics=log.metrics | {"true_episode_cost": np.array([FLAT])})
+    monkeypatch.setattr(verdict, "read", lambda folder, note: log)
+    (said, _) = verdict.lines(pathlib.Path("run"))
+    assert said.startswith("limit 1 on true costs: kept by 0 of 1 seed") and said.endswith("the worst 0.3 beyond")
+
+
 def test_each_agent_and_a_seed_that_broke_count(monkeypatch: pytest.MonkeyPatch):
     """The mean over agents hides agent 0, which is beyond by 8."""
     log = log_of([np.full(20, 9.0), np.full(20, 9.0)], deployed=[9.0, np.nan], limit=10.0)
     agents = {"episode_cost/agent_0": np.full((2, 20), 18.0), "episode_cost/agent_1": np.zeros((2, 20))}
     ended = {"episode_cost/agent_0": np.array([18.0, np.nan]), "episode_cost/agent_1": np.array([0.0, np.nan])}
-    log = run_log.dataclasses.replace(
-        log, metrics=log.metrics | agents, evaluation=log.evaluation | ended, broken={1: 2000}
-    )
+    log = dataclasses.replace(log, metrics=log.metrics | agents, evaluation=log.evaluation | ended, broken={1: 2000})
     monkeypatch.setattr(verdict, "read", lambda folder, note: log)
     assert verdict.lines(pathlib.Path("run"))[0].count(", the worst 8 beyond") == 2
 
