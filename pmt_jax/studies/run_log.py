@@ -110,7 +110,7 @@ class RunLog:
 
     @property
     def excess(self) -> np.ndarray:
-        """[S] how far each seed's costs at the end (see `final`) are beyond their limits: the agent and cost furthest."""
+        """[S] how far a seed's costs at the end (see `final`) are beyond their limits, the agent and cost furthest."""
         name = "true_episode_cost" if self._judges_true_costs else "episode_cost"
         return self.judged_limits.excess(self._costs(name))
 

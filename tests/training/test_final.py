@@ -134,7 +134,7 @@ CASES = {
     "many": (
         log_of([FLAT - x for x in [0] * 4 + [1, 0, 0, 1] * 6]),
         "kept by 12 of 28",
-        " and others, 16 in all: costs",
+        " and others, 16 in all: ",
     ),
     "in a row": (log_of([FLAT - x for x in (0, 0, 0, 1, 0, 0, 1, 0)]), "2 of 8", "seeds 0 to 2, 4, 5, 7: costs stay"),
     "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
