@@ -90,7 +90,7 @@ class State:
       cost: [N, K] in [0, 1], for the transition that led here (0 after a reset).
       terminated: [] bool, the task ended here by its own rule (never by a time limit).
       info: scalars for reporting, the same keys from reset on.
-      carry: the environment's own quantities.
+      carry: the environment's own quantities, any pytree of finite numbers.
     """
 
     obs: jax.Array
@@ -196,6 +196,7 @@ class Declarations:
       baselines: name -> a function that makes a policy which needs no training.
       overflow: the name in `info` that is above 0 if the physics lost contacts, which makes a step wrong.
       kernels: what the physics needs compiled besides XLA's programs, as calls for any threads; only warp needs some.
+      stepped: model, readout and forward pass of `make_engine`, where the model is not that of the picture.
     """
 
     observation: Blocks = ()
@@ -205,6 +206,7 @@ class Declarations:
     baselines: Mapping[str, Callable[[], Controller]] = dataclasses.field(default_factory=dict)
     overflow: str | None = None
     kernels: Callable[[], Sequence[Callable[[], Any]]] = tuple
+    stepped: tuple[Any, Mapping[str, Any], bool] | None = None
 
 
 def shares_cost(env: Env) -> bool:

@@ -175,6 +175,7 @@ def _check_engine(env: Env, name: str) -> None:
 def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
     """Compares the shapes of what `reset` returns with the spec."""
     import chex
+    import jax.numpy as jnp
 
     n = spec.num_agents
     shapes = {"obs": (n, spec.obs_dim), "global_state": (spec.state_dim,), "reward": (), "cost": (n, spec.num_costs)}
@@ -189,6 +190,10 @@ def _check_fields(spec: EnvSpec, start: Any, name: str) -> None:
         except (AssertionError, AttributeError):
             got = getattr(getattr(start, field), "shape", None)
             raise TaskError(f"{name}: reset gives {field} of shape {got}, but its spec says {shape}") from None
+    for field in ("reward", "cost"):
+        kind = getattr(start, field).dtype
+        if not jnp.issubdtype(kind, jnp.floating):
+            raise TaskError(f"{name}: {field} must be floating, not {kind}; add .astype(float)")
     if start.terminated.dtype != bool:
         raise TaskError(f"{name}: terminated must be a bool, not {start.terminated.dtype}")
     if not isinstance(start.info, dict):
@@ -216,7 +221,11 @@ def _check_values(env: Env, name: str) -> None:
             return after, seen(after)
 
         def seen(state: Any) -> dict[str, jax.Array]:
-            return {field: getattr(state, field) for field in ("obs", "global_state", "reward", "cost")}
+            found = {field: getattr(state, field) for field in ("obs", "global_state", "reward", "cost")}
+            for path, leaf in jax.tree_util.tree_leaves_with_path(jax.tree.map(jnp.asarray, state.carry)):
+                if jnp.issubdtype(leaf.dtype, jnp.floating):  # 0, or what is not finite
+                    found["carry" + jax.tree_util.keystr(path)] = jnp.sum(leaf - leaf)
+            return found
 
         start = env.reset(key)
         mask = jnp.asarray(env.spec.action_mask, float)

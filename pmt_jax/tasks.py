@@ -165,19 +165,22 @@ def engines(env: Env | None = None) -> tuple[str, dict[str, str | None]]:
     with _asked():
         physics = _module("physics")
         physics.check_versions()
-        model = _model(env)
-        return physics.resolve("auto", model), {name: physics.obstacle(name, model) for name in physics.ENGINES}
+        step = _stepped(env)
+        return physics.resolve("auto", *step), {name: physics.obstacle(name, *step) for name in physics.ENGINES}
 
 
-def _model(env: Env | None) -> Any:
-    """The MjModel that a task's physics steps, as far as the task declares one."""
-    return None if env is None else getattr(_module("base").declarations(env).picture, "model", None)
+def _stepped(env: Env | None) -> tuple[Any, Any, bool]:
+    """The MjModel that a task's physics steps, its readout and forward pass, as far as the task declares them."""
+    if env is None:
+        return None, None, False
+    declared = _module("base").declarations(env)
+    return declared.stepped or (getattr(declared.picture, "model", None), None, False)
 
 
 def advice(env: Env) -> str | None:
     """What would make a task's physics faster on this machine, as a sentence; None if nothing is known."""
-    model = _model(env)
-    return _module("physics").advice(model) if model is not None else None
+    model, readout, _ = _stepped(env)
+    return _module("physics").advice(model, readout) if model is not None else None
 
 
 def compiler() -> str:

@@ -84,6 +84,8 @@ def main() -> None:
     args = parser.parse_args()
     env = envs.make(args.task, data=args.data, noise=False)
     assert isinstance(env, VoltageControl)
+    if not 0 <= args.day < env.profiles.days:
+        parser.error(f"--day must be from 0 to {env.profiles.days - 1}, not {args.day}")
     row = args.day * ROWS_PER_DAY
     before, after = (day_of_voltages(env, CONTROLLERS[name](env), row) for name in ("zero", args.policy))
     draw(env, before, after, "optimal dispatch" if args.policy == "opf" else args.policy, args.out)

@@ -39,7 +39,7 @@ import numpy as np
 
 from ..base import Declarations, EnvSpec, Scene, State
 from ..blocks import Block, Blocks, length, motors
-from ..errors import one_of, typed
+from ..errors import TaskError, one_of, typed
 from ..physics import PhysicsState, kernels_of, make_engine, resolve
 
 MODEL = Path(__file__).parent / "hand_over.xml"
@@ -186,7 +186,9 @@ class HandOver:
     ):
         num_agents, self._costly, self._free = VARIANTS[one_of("variant", variant, VARIANTS)]
         one_of("egg", egg, ("auto", "ellipsoid", "capsule"))
-        physics = resolve(physics, model(one_of("object", object, OBJECTS), egg == "capsule", full_hand))
+        if one_of("object", object, OBJECTS) != "egg" and egg != "auto":
+            raise TaskError(f"egg is the shape of an egg, but the object is a {object}; leave egg out")
+        physics = resolve(physics, model(object, egg == "capsule", full_hand))
         capsule = egg == "capsule" or (egg == "auto" and physics == "mjx")
         self.model = model(object, capsule, full_hand)
         hinges = slice(0, HINGES)

@@ -163,14 +163,9 @@ class MultiGoal:
     def _build_engines(self, physics: str, threads: int | None) -> None:
         self.model = model(self.robot, self.num_agents, self.vases.count, self.size)
         stepped = model(self.robot, self.num_agents, self.vases.slots, self.size)
-        make = functools.partial(
-            make_engine,
-            stepped,
-            readout={"qacc": ("qacc", slice(self.vases.nv))},
-            forward=True,
-            physics=physics,
-            threads=threads,
-        )
+        readout = {"qacc": ("qacc", slice(self.vases.nv))}
+        self._stepped = stepped, readout, True
+        make = functools.partial(make_engine, stepped, readout=readout, forward=True, physics=physics, threads=threads)
         self._engine, self._at_rest = make(substeps=SUBSTEPS), make(substeps=0)
         self.engine = self._engine.name
 
@@ -192,6 +187,7 @@ class MultiGoal:
             baselines=policies(self),
             overflow="physics_overflow",
             kernels=functools.partial(kernels_of, self._engine, self._at_rest),
+            stepped=self._stepped,
         )
         num_costs = len(self.charges) if self._by_kind else 1
         self.spec = EnvSpec(

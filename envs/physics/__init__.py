@@ -28,7 +28,7 @@ import copy
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ..errors import TaskError
+from ..errors import TaskError, at_least
 from .contract import (
     ENGINES,
     Engine,
@@ -87,6 +87,8 @@ def make_engine(
       TaskError: unknown engine, or one that cannot run here, or not with this model.
     """
     chosen = resolve(physics, model, readout, forward)
+    if threads is not None:
+        at_least("threads", threads, 1)
     if model.na or model.nmocap:
         raise ValueError("PhysicsState carries neither activations nor mocap bodies, which this model has")
     model = copy.copy(model)

@@ -174,9 +174,9 @@ def explain() -> dict[str, str | None]:
     return {name: obstacle(name) for name in ENGINES}
 
 
-def advice(model: mujoco.MjModel) -> str | None:
+def advice(model: mujoco.MjModel, readout: Readout | None = None) -> str | None:
     """What would make a model's steps faster on this machine, as a sentence; None if nothing is known."""
-    if obstacle("mujoco") or obstacle("fused") is None or _refused(model, None):
+    if obstacle("mujoco") or obstacle("fused") is None or _refused(model, readout):
         return None
     return f"physics engine 'fused' steps this model several times as fast, but it {obstacle('fused')}"
 

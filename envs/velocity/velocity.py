@@ -81,7 +81,7 @@ class Velocity:
     Args:
       variant: one of `envs.velocity.VARIANTS`.
       threshold: m/s, a faster step costs; the benchmark's if None.
-      partition: the actuators of each agent, e.g. `[[0, 1, 2], [3, 4, 5]]`; the benchmark's if None.
+      partition: the actuators of each agent, e.g. `((0, 1, 2), (3, 4, 5))`; the benchmark's if None.
       cost: `indicator` (1 above the threshold), or `excess` (how far above it, as a share of the threshold, at most 1).
       fall_cost: adds a second cost, 1 where the episode ends by the robot's rule of health; limit 0.1.
       observation: `zscore` (each vector standardised over its own entries, as SafePO does) or `raw` (for learners that
@@ -325,7 +325,7 @@ def _checked(partition: Any, motors: int) -> Partition:
             f"partition must give each of the actuators 0 to {motors - 1} to one agent, and every agent at least one, "
             f"not {[list(agent) for agent in agents]}"
         )
-    return tuple(tuple(agent) for agent in agents)
+    return tuple(tuple(int(motor) for motor in agent) for agent in agents)
 
 
 def _motors(partition: Partition) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -167,12 +167,21 @@ class VoltageControl:
         self.barrier = one_of("barrier", barrier or scenario.barrier, BARRIERS)
         self.noise = noise
         self._reward_kind = one_of("reward", reward, ("mapdn", "loss_only"))
-        self._weights = (voltage_weight, q_weight, line_weight)
+        self._weights = (
+            at_least("voltage_weight", voltage_weight, 0),
+            at_least("q_weight", q_weight, 0),
+            line_weight if line_weight is None else at_least("line_weight", line_weight, 0),
+        )
         self._cost_kind = one_of("cost", cost, COSTS)
         self._cost_scope = one_of("cost_scope", cost_scope, SCOPES)
         self.v_lower, self.v_upper = v_lower, v_upper
         if not v_lower < v_upper:
             raise TaskError(f"v_lower must be below v_upper, but {v_lower:g} is not below {v_upper:g}")
+        if not v_lower > 0:
+            raise TaskError(f"v_lower must be a voltage above 0 p.u., not {v_lower:g}")
+        if not pv_scale > 0:
+            raise TaskError(f"pv_scale must be above 0, as the inverters' limits scale with it, not {pv_scale:g}")
+        at_least("demand_scale", demand_scale, 0)
         self._first_row = 1 if one_of("timing", timing, ("mapdn", "plain")) == "mapdn" else 0
         self._history = at_least("history", history, 1)
         self._limit = at_least("episode_limit", episode_limit, 2)
@@ -333,10 +342,14 @@ class VoltageControl:
     # Data
 
     def data_row(self, index: jax.Array) -> jax.Array:
-        """[n_pv + 2 n_load] the profiles at row `index` [], interpolated between knots, without noise."""
+        """[n_pv + 2 n_load] the profiles at row `index` [], interpolated between knots, without noise.
+
+        Before the first row the data are as there, and behind the last one as there.
+        """
         per_knot = self.profiles.rows_per_knot
+        index = jnp.clip(index, 0, self.profiles.num_rows - 1)
         if per_knot == 1:
-            return self._bank[jnp.clip(index, 0, self._bank.shape[0] - 1)]
+            return self._bank[index]
         knot = jnp.clip(index // per_knot, 0, self._bank.shape[0] - 2)
         weight = (index - knot * per_knot).astype(self._dtype) / per_knot
         return self._bank[knot] * (1 - weight) + self._bank[knot + 1] * weight
@@ -518,7 +531,9 @@ def barrier(kind: str, vm_pu: jax.Array) -> jax.Array:
 
 def _blocks(state_space: str | tuple[str, ...]) -> tuple[str, ...]:
     names = state_space.split(",") if isinstance(state_space, str) else state_space
-    chosen = {one_of("state_space block", name.strip(), BLOCKS) for name in names}
+    if not names:
+        raise TaskError(f"state_space must keep at least one of {', '.join(BLOCKS)}")
+    chosen = {one_of("state_space block", str(name).strip(), BLOCKS) for name in names}
     return tuple(block for block in BLOCKS if block in chosen)
 
 

@@ -346,6 +346,16 @@ def test_columns_need_no_jax():
         ("voltage_33", {"v_lower": 1.2}, "v_lower must be below v_upper, but 1.2 is not below 1.05"),
         ("voltage_33", {"data": 3}, "data must be a text or a Path or a Profiles, not 3"),
         ("voltage_33", {"history": 0}, "history must be at least 1, not 0"),
+        ("voltage_33", {"v_lower": -1.0}, "v_lower must be a voltage above 0 p.u., not -1"),
+        ("voltage_33", {"pv_scale": 0.0}, "pv_scale must be above 0, as the inverters' limits scale with it, not 0"),
+        ("voltage_33", {"demand_scale": -1.0}, "demand_scale must be at least 0, not -1.0"),
+        ("voltage_33", {"q_weight": -1.0}, "q_weight must be at least 0, not -1.0"),
+        ("voltage_33", {"line_weight": -1.0}, "line_weight must be at least 0, not -1.0"),
+        ("voltage_33", {"voltage_weight": -1.0}, "voltage_weight must be at least 0, not -1.0"),
+        ("voltage_33", {"state_space": ()}, "state_space must keep at least one of demand, pv"),
+        ("voltage_33", {"state_space": (1, 2)}, "unknown state_space block '1'"),
+        ("ant_2x4", {"threads": 0, "physics": "mjx"}, "threads must be at least 1, not 0"),
+        ("hand_over_2x6", {"object": "block", "egg": "capsule"}, "the object is a block; leave egg out"),
     ],
 )
 def test_options_that_cannot_be(task, options, says):

@@ -131,6 +131,13 @@ GOOD = EXAMPLE.read_text()
         (GOOD.replace("cost=tilt > 0.3", "cost=-1.0"), "", "costs must be within [0, 1], but the first steps give -1"),
         (GOOD.replace("reward=speed", "reward=speed / 0"), "", "reward is not finite after step 1"),
         (
+            GOOD.replace("carry=ends", "carry=(ends, jnp.full(2, jnp.inf))").replace("state.carry", "state.carry[0]"),
+            "",
+            "carry[1] is not finite after reset",
+        ),
+        (GOOD.replace("reward, jnp.float32", "reward, int"), "", "reward must be floating, not int32; add .astype("),
+        (GOOD.replace("cost, jnp.float32", "cost, bool"), "", "cost must be floating, not bool; add .astype(float)"),
+        (
             GOOD.replace("ends**2", "endz**2"),
             ":Pole",
             "step fails: NameError: name 'endz' is not defined (env.py, line ",

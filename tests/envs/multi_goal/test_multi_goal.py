@@ -22,8 +22,10 @@ from envs.multi_goal.models import COLOURS
 from envs.multi_goal.multi_goal import KINDS, VASE_HEIGHT
 from envs.multi_goal.scene import HAZARD_COLOUR
 from envs.multi_goal.sensing import SENSORS
-from envs.physics import PhysicsState
+from envs.physics import PhysicsState, contract
+from envs.physics.fused import nvrtc
 from paths import DATA
+from pmt_jax import tasks
 from stepping import compiled
 
 NAMES = [f"multi_goal_{variant}" for variant in VARIANTS]
@@ -415,6 +417,20 @@ def test_options_that_cannot_be_are_refused_in_a_sentence(name, options, says):
 def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_point_2").engine == "fused"
     assert envs.make("multi_goal_ant_2", wiring="own", num_agents=8).engine == "mujoco"
+
+
+def test_what_can_step_it_is_asked_of_the_model_with_slots(monkeypatch: pytest.MonkeyPatch):
+    """The picture's model has all vases, too many for one warp of a GPU."""
+
+    class Gpu:
+        platform, device_kind = "gpu", "NVIDIA H200"
+
+    env = envs.make("multi_goal_point_2", physics="mujoco")
+    monkeypatch.setattr(jax, "devices", lambda: [Gpu])
+    monkeypatch.setattr(contract, "installed_version", lambda _: f"{contract.MUJOCO_SERIES}.0")
+    monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
+    auto, obstacles = tasks.engines(env)
+    assert auto == "fused" and obstacles["fused"] is None and "no forward pass" in str(obstacles["warp"])
 
 
 VIOLET = HAZARD_COLOUR[:3]

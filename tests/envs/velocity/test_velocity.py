@@ -278,3 +278,12 @@ def test_standing_still_is_worth_1003_to_the_ant():
 def test_mistakes_get_one_sentence(options, said):
     with pytest.raises(TaskError, match=said):
         envs.make("velocity_ant_2x4", **options)
+
+
+def test_a_partition_of_digits_is_one_of_numbers():
+    """As a command line or a file may give it."""
+    given, meant = (
+        envs.make("velocity_half_cheetah_2x3", physics="mujoco", partition=partition)
+        for partition in ((("0", "1", "2"), ("3", "4", "5")), ((0, 1, 2), (3, 4, 5)))
+    )
+    assert given.declares.actions == meant.declares.actions

@@ -281,6 +281,9 @@ def test_rows_between_knots_are_on_straight_lines(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows[0], knots[20], rtol=1e-6)
     np.testing.assert_allclose(rows[1], 0.6 * knots[20] + 0.4 * knots[21], rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(rows[2], knots[21], rtol=1e-6)
+    outside = jax.jit(jax.vmap(env.data_row))(jnp.array([-5, env.profiles.num_rows - 1, env.profiles.num_rows + 900]))
+    np.testing.assert_array_equal(outside[0], knots[0].astype(np.float32))
+    np.testing.assert_array_equal(outside[1:], np.tile(knots[-1].astype(np.float32), (2, 1)))
     few = profiles.Profiles(env.profiles.pv[:21], env.profiles.p_load[:21], env.profiles.q_load[:21], rows_per_knot=5)
     at = np.arange(few.num_rows) / 5
 
