@@ -78,7 +78,7 @@ def _train(folder: pathlib.Path, case: Case) -> Record:
         "compile_seconds": float(compiled[1]),
         "first_update_seconds": round(first or time.perf_counter() - begin, 2),
         "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
-        "memory_gb": round(usage.ru_maxrss / (1e6 if sys.platform == "linux" else 1e9), 3),
+        "memory_gb": round(usage.ru_maxrss * (1024 if sys.platform == "linux" else 1) / 1e9, 3),
     }
 
 

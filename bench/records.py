@@ -67,13 +67,15 @@ def load(source: str | pathlib.Path = RESULTS) -> dict[str, Report]:
     """Results by name: of a JSON file, of a folder, or as committed in a git revision.
 
     Raises:
-      UsageError: it is none of these.
+      UsageError: it is none of these, or a file without measurements.
     """
     path = pathlib.Path(source)
     if path.is_dir():
         return _reports((p.stem, p.read_text()) for p in sorted(path.glob("*.json")))
     if path.is_file():
-        return _reports([(path.stem, path.read_text())])
+        if found := _reports([(path.stem, path.read_text())]):
+            return found
+        raise UsageError(f"{path} holds no measurements; give a file that python -m bench run wrote")
     if (listed := git("ls-tree", "--name-only", str(source), "results/")) is None:
         raise UsageError(f"'{source}' is neither a file of results, a folder of them nor a git revision")
     names = [name for name in listed.splitlines() if name.endswith(".json")]
@@ -82,8 +84,13 @@ def load(source: str | pathlib.Path = RESULTS) -> dict[str, Report]:
 
 def _reports(texts: Iterable[tuple[str, str]]) -> dict[str, Report]:
     """Those of `texts` that `write` wrote."""
-    parsed = ((name, json.loads(text)) for name, text in texts)
-    return {name: report for name, report in parsed if isinstance(report, dict) and {"rows", "device"} <= set(report)}
+    parsed = {}
+    for name, text in texts:
+        try:
+            parsed[name] = json.loads(text)
+        except ValueError as error:
+            raise UsageError(f"{name}.json is damaged: {error}") from None
+    return {name: x for name, x in parsed.items() if isinstance(x, dict) and {"rows", "device"} <= set(x)}
 
 
 def git(*words: str) -> str | None:

@@ -36,6 +36,7 @@ WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
 TRUE = "true cost"  # also of steps that the learner did not observe
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
+BEYOND = "beyond"  # the limit, of the agent and cost furthest beyond; older files have none
 
 
 def store(folders: Sequence[pathlib.Path], out: pathlib.Path, same_end: bool = False, points: int = plot.POINTS) -> int:
@@ -88,7 +89,8 @@ def _compact(log: RunLog, points: int) -> Run:
     if evaluated.any():
         last = np.flatnonzero(evaluated)[-1]
         scores |= {f"{OF_MEAN_ACTIONS}{x}": log.metrics[f"eval/episode_{x}"][:, last] for x in ("cost", "reward")}
-    scores |= {f"{OF_MEAN_ACTIONS}{x}": row.deployed[x] for x in ("cost", "reward") if x in row.deployed}
+    scores |= {f"{OF_MEAN_ACTIONS}{x}": row.deployed[x] for x in ("cost", "reward", BEYOND) if x in row.deployed}
+    scores[BEYOND] = row.beyond
     names = [name for name in (*CURVES, *TRUE_CURVES) if name in found.metrics]
     kept = (*DIAGNOSTICS, *(f"info/{name}" for name in columns(found.task)))
     diagnostics = {name: x.mean(0) for name, x in found.metrics.items() if name.startswith(kept)}
@@ -102,6 +104,7 @@ def _compact(log: RunLog, points: int) -> Run:
         "task": found.task,
         "method": found.method,
         "cost_limit": found.limits.total,
+        "limits": list(found.limits.each),
         "seconds": float(np.nanmax(log.metrics["seconds"])),
         "versions": log.versions,
         "commit": (records.git("rev-parse", "--short", "HEAD") or "unknown").strip(),
@@ -121,7 +124,7 @@ def curves(run: Run) -> RunLog:
         folder=pathlib.Path(run["task"]),
         task=run["task"],
         method=run["method"],
-        limits=Limits((run["cost_limit"],)),
+        limits=_limits(run),
         settings=tomllib.loads(run["config"]),
         seeds=tuple(run["seeds"]),
         steps=np.array(run["steps"]),
@@ -175,9 +178,9 @@ def as_overview(files: pathlib.Path) -> str:
     cells = {
         (task, row.method): text
         for (task, _), (row, text) in _summaries(files).items()
-        if row.settings or METHODS[row.method].constraint != "lagrangian"
+        if row.settings or not has_multiplier(row.method)
     }
-    methods = [method for method in METHODS if any(method == name for _, name in cells)]
+    methods = sorted({name for _, name in cells}, key=_rank)
     body = [
         [f"`{task}`", *(cells.get((task, method), "-") for method in methods)]
         for task in dict.fromkeys(task for task, _ in cells)
@@ -194,7 +197,16 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
         f"{round(x['within'] * x['seeds'])} of {x['seeds']}"
         for x in table.summarise(found)
     ]
+    often = collections.Counter((row.task, row.label) for row in found)
+    if doubled := [f"{label} on {task}" for (task, label), count in often.items() if count > 1]:
+        raise UsageError(f"{files}: several runs of {doubled[0]}, of which a table of methods by tasks can show one")
     return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
+
+
+def _rank(method: str) -> tuple[int, str]:
+    """Sorts as METHODS is; methods that are not in it last."""
+    order = list(METHODS)
+    return (order.index(method) if method in order else len(order)), method
 
 
 def as_printed(file: pathlib.Path) -> str:
@@ -251,7 +263,7 @@ def as_ran(files: pathlib.Path) -> str:
     body = []
     for name in files.stem.split("+"):
         found = load(files.with_stem(name))
-        held = [run for run in found if METHODS[run["method"]].constraint == "lagrangian"]
+        held = [run for run in found if has_multiplier(run["method"])]
         kept = [beyond <= 0 for run in held for beyond in row_of(run).beyond]
         first, steps = found[0], sorted({max(run["steps"]) for run in found})
         span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
@@ -272,15 +284,24 @@ def _mean_std(*mean_and_std: float | None) -> str:
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:
     """Whether a run's multiplier follows PID; the setting is there for methods without one, too."""
-    lagrangian = method in METHODS and METHODS[method].constraint == "lagrangian"
-    return lagrangian and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
+    return has_multiplier(method) and any(settings.get(gain) for gain in ("lambda_kp", "lambda_kd"))
+
+
+def has_multiplier(method: str) -> bool:
+    """Whether it is one of ours with a multiplier."""
+    return method in METHODS and METHODS[method].constraint == "lagrangian"
 
 
 def row_of(run: Run) -> TableRow:
     """A stored run as a row of a table, which tells a multiplier with PID from one without."""
     settings = "pid" if has_pid(run["method"], tomllib.loads(run.get("config", ""))) else ""
-    limits = Limits((run["cost_limit"],))
-    return TableRow(run["task"], run["method"], settings, limits, max(run["steps"]), run["source"], _scores(run))
+    scores = _scores(run)
+    place = run["task"], run["method"], settings, _limits(run), max(run["steps"]), run["source"]
+    return TableRow(*place, scores, excess=scores.get(BEYOND))
+
+
+def _limits(run: Run) -> Limits:
+    return Limits(tuple(run.get("limits", [run["cost_limit"]])))
 
 
 def _scores(run: Run) -> dict[str, np.ndarray]:
@@ -296,7 +317,7 @@ def as_points(file: pathlib.Path) -> str:
     found = load(file)
     hidden = any(run["table"].get(TRUE, run["table"]["cost"]) != run["table"]["cost"] for run in found)
     columns = ("cost", *([TRUE] if hidden else ()), WHILE_TRAINING, "reward")
-    found.sort(key=lambda run: (run["task"], list(METHODS).index(run["method"])))
+    found.sort(key=lambda run: (run["task"], _rank(run["method"])))
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
     def cell(values: np.ndarray) -> str:
@@ -312,17 +333,18 @@ def as_mean_actions(file: pathlib.Path) -> str:
 
     Costs are the worst agent's where agents differ.
     """
-    order = list(METHODS)
-    found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], order.index(run["method"])))
+    found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], _rank(run["method"])))
     several = len({run["task"] for run in found}) > 1
     body = []
     for run in found:
         label = " ".join(word for word in run["label"].split() if not word.startswith("cost_limit="))
         line = [*([run["task"]] if several else []), f"{run['cost_limit']:g}", label]
         row = row_of(run)
-        deployed = (row.scores[f"{OF_MEAN_ACTIONS}{name}"] for name in ("cost", "reward"))
-        for cost, reward in ((row.score("worst agent"), row.scores["reward"]), deployed):
-            line += [f"{(cost <= run['cost_limit']).sum()} of {cost.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
+        cost, reward = (row.scores[f"{OF_MEAN_ACTIONS}{name}"] for name in ("cost", "reward"))
+        beyond = row.scores.get(f"{OF_MEAN_ACTIONS}{BEYOND}", cost - run["cost_limit"])
+        with_noise = row.beyond, row.score("worst agent"), row.scores["reward"]
+        for excess, cost, reward in (with_noise, (beyond, cost, reward)):
+            line += [f"{(excess <= 0).sum()} of {excess.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
         body.append(line)
     about, measured = ["task", "limit", "method"][not several :], ["seeds within", "cost", "reward"]
     return markdown((*about, *measured, *(f"mean actions: {name}" for name in measured)), body)

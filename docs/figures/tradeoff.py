@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from bench import records
 from bench.tables import runs
+from pmt_jax import load_config
 from pmt_jax.studies.plot import INK, METHOD_COLOURS, cost_ticks
 
 from . import style
@@ -28,8 +29,15 @@ FIGURES = {
 def _by_task(files: tuple[str, ...]) -> dict[str, list[runs.Run]]:
     """The runs with each method's own settings, by task."""
     found = [run for name in files for run in runs.load(records.RESULTS / f"{name}.json")]
-    usual = [run for run in found if run.get("label", run["method"]) == run["method"]]
+    usual = [run for run in found if _is_usual(run)]
     return {task: [run for run in usual if run["task"] == task] for task in dict.fromkeys(r["task"] for r in usual)}
+
+
+def _is_usual(run: runs.Run) -> bool:
+    """Whether what sets the run apart from others in its file is its method's default."""
+    config = load_config(run["task"], method=run["method"])
+    apart = (word.split("=") for word in run.get("label", run["method"]).split()[1:])
+    return all(str(getattr(config, name, None)) == value for name, value in apart)
 
 
 def draw(files: tuple[str, ...], file: pathlib.Path) -> None:

@@ -520,6 +520,46 @@ def test_seeds_within_are_judged_by_the_worst_agent(tmp_path: pathlib.Path):
     assert "| 14 of 20 |" in line
 
 
+def test_seeds_within_are_judged_by_true_costs_where_few_were_noticed(tmp_path: pathlib.Path):
+    """A tenth of the costs is noticed: 0.5 of a limit of 1, but 20 of 10 of them all."""
+    run = fake_run(tmp_path / "run", cost_seen=0.1)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    rows = [row | {"cost_limit": 1.0, "episode_cost": 0.5, "true_episode_cost": 20.0} for row in rows]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    runs.store([run], tmp_path / "run.json")
+    (stored,) = runs.load(tmp_path / "run.json")
+    assert stored["table"]["beyond"] == [10.0, 10.0] and stored["limits"] == [1.0]
+    assert ", 0 of 2" in runs.as_summary(tmp_path / "run.json")
+
+
+def test_a_table_of_methods_by_tasks_refuses_two_runs_of_one_cell(tmp_path: pathlib.Path):
+    two = [run_of_three_seeds("f4sg", seen, [1.0]) for seen in (1.0, 0.5)]
+    (tmp_path / "x.json").write_text(json.dumps(two))
+    for kind in (runs.as_summary, runs.as_overview):
+        with pytest.raises(UsageError, match="several runs of f4sg on lane"):
+            kind(tmp_path / "x.json")
+
+
+def test_a_method_of_a_file_has_a_line_in_every_table(tmp_path: pathlib.Path):
+    run = run_of_three_seeds("mine", 1.0, [1.0, 2.0]) | {
+        "label": "mine",
+        "versions": {"device": "cpu", "engine": "xla"},
+    }
+    run["table"] |= {f"of mean actions: {name}": [1.0, 2.0] for name in ("cost", "reward")}
+    (tmp_path / "x.json").write_text(json.dumps([run]))
+    for kind in (runs.as_points, runs.as_mean_actions, runs.as_ran, runs.as_overview, runs.as_summary, runs.as_paper):
+        assert "1 of 1" not in kind(tmp_path / "x.json") and len(kind(tmp_path / "x.json").splitlines()) == 3
+
+
+@pytest.mark.parametrize(("text", "says"), [("[]", "x.json holds no measurements"), ("[", "x.json is damaged")])
+def test_files_that_cannot_be_compared_are_one_sentence(text: str, says: str, tmp_path: pathlib.Path, capsys):
+    (tmp_path / "x.json").write_text(text)
+    good = str(records.RESULTS / "ant.json")
+    assert main(["compare", good, str(tmp_path / "x.json")]) == 2
+    err = capsys.readouterr().err
+    assert says in err and err.count("\n") == 1
+
+
 def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
     found = [run for run in stored()["velocity_h200"] if run["task"] == "velocity_ant_2x4"]
     one = next(run for run in found if run["method"] == "mixed")
