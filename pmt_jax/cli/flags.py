@@ -11,6 +11,7 @@ from ..config.fields import GROUPS
 from ..config.load import expectation, load_config
 from ..config.methods import METHODS
 from ..config.settings import FIELDS, Config
+from ..errors import UsageError
 from .parser import EVERYTHING, HELP, path
 
 _METAVARS = {int: "N", float: "X"}
@@ -49,7 +50,12 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
     """The settings that the command line names."""
     pairs = vars(arguments).items()
     found = {name.removeprefix(_PREFIX): x for name, x in pairs if name.startswith(_PREFIX) and x is not None}
-    return found | ({"init": str(path(found["init"]))} if found.get("init") else {})
+    if found.get("init"):
+        try:
+            found["init"] = str(path(found["init"]))
+        except argparse.ArgumentTypeError as error:
+            raise UsageError(f"--init {error}") from None
+    return found
 
 
 class _Help(argparse.Action):

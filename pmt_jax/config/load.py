@@ -27,6 +27,7 @@ _PACKAGE = pathlib.Path(__file__).parents[1]
 CONFIG_DIR = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 
 Table = dict[str, Any]
+CHOSEN = ""  # among tables [method.NAME], in place of a name: which of them is meant
 
 
 def load_config(
@@ -56,7 +57,7 @@ def load_config(
     """
     table = source if isinstance(source, dict) else _read(source)
     source = "a [[sweep]]" if isinstance(source, dict) else source
-    own = table.get("method")
+    own = chosen(table)
     if method is None:
         method = own if isinstance(own, str) else str(Config.method)
     method = methods.known(method)
@@ -85,13 +86,14 @@ def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) 
     tables = table.get("method", {})
     if isinstance(tables, str):  # a run's own config.toml names its one method
         return shared
+    tables = {name: own for name, own in tables.items() if name != CHOSEN} if isinstance(tables, dict) else tables
     if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
         raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
     for name, own in tables.items():  # those of other methods, too, or a typing error shows in one run of many
         methods.known(name)
         for field, value in own.items():
             convert(field, value)
-    return shared | tables.get(method, {})
+    return _merged(shared, tables.get(method, {}))
 
 
 def to_toml(config: Config) -> str:
@@ -208,8 +210,21 @@ def _identity(source: str) -> str:
 
 
 def over(base: Table, top: Table) -> Table:
-    """`top` laid over `base`, tables within them key by key."""
-    both = {key: over(base[key], top[key]) for key in base.keys() & top.keys() if _tables(base[key], top[key])}
+    """`top` laid over `base`, tables within them key by key; a method named by one stays beside tables of the other."""
+    named = [layer for layer in (base, top) if not isinstance(layer.get("method", {}), dict)]
+    if len(named) == 1 and "method" in base and "method" in top:
+        base, top = (x | {"method": {CHOSEN: x["method"]}} if x in named else x for x in (base, top))
+    return _merged(base, top)
+
+
+def chosen(table: Table) -> Any:
+    """The method that settings name; None if they do not."""
+    method = table.get("method")
+    return method.get(CHOSEN) if isinstance(method, dict) else method
+
+
+def _merged(base: Table, top: Table) -> Table:
+    both = {key: _merged(base[key], top[key]) for key in base.keys() & top.keys() if _tables(base[key], top[key])}
     return {**base, **top, **both}
 
 

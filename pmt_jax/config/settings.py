@@ -231,10 +231,6 @@ def _validate(config: Config) -> None:
         raise UsageError(f"seed must lie between 0 and 2**31 - seeds, not {config.seed}")
     if config.lambda_init > config.lambda_max:
         raise UsageError(f"lambda_init = {config.lambda_init} lies above lambda_max = {config.lambda_max}")
-    if config.lambda_max and not config.lambda_init:
-        raise UsageError(
-            "a multiplier of 0 never moves, for it changes in proportion to itself; set lambda_init above 0"
-        )
     for option, hint in ("physics", "set physics = ... (--physics)"), ("name", "name the task itself"):
         if option in dict(config.env):
             raise UsageError(f"'{option}' is no option of a task; {hint} and leave it out of env")

@@ -159,8 +159,7 @@ def appraise_regret(
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(setup.nets.num_agents))
     learned, (after, metrics) = jax.vmap(one_agent)(net, samples, keys)
-    # Adam's momentum would move a network that had nothing to learn from.
-    learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
+    learned = regret.where_costly(costly, learned, net)
     after = jnp.moveaxis(after, (1, 2, 0), (0, 1, 2)).reshape(-1, *before.shape)  # [epochs, T, B, N, A]
     moving = log_weight(after, before, batch.cost, mask, hyper.omega)
     whole = log_weight(after[-1], before, batch.cost, mask, jnp.inf)

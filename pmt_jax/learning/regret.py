@@ -39,13 +39,21 @@ def appraise_regret(
     passes = {"epochs": setup.config.emotion_epochs, "minibatches": setup.config.minibatches}
     limits = {"learning_rate": now.emotion_lr, "max_grad_norm": hyper.max_grad_norm}
     learned, metrics = jax.vmap(lambda *each: fit(each[0], loss, *each[1:], **limits, **passes))(net, samples, keys)
-    # Adam's momentum would move a network that had nothing to learn from.
-    learned = jax.tree.map(lambda new, old: jnp.where(costly.any(), new, old), learned, net)
+    learned = where_costly(costly, learned, net)
     after = logits_of_agents(setup, learned.params, batch)
     new, old = regret(after, batch.cost), regret(before, batch.cost)
     log_weight = regret_weight(new, old, mask, omega=hyper.omega, bound=hyper.kappa * hyper.clip)
     shown = diagnostics(after, new, mask, costly, jnp.exp(log_weight))
     return learned, log_weight, {**{k: x.mean(0) for k, x in metrics.items()}, **shown}
+
+
+def where_costly(costly: jax.Array, learned: TrainState, net: TrainState) -> TrainState:
+    """The networks that have `learned`, but those of agents without a costly entry [T, B, N, A] as they were.
+
+    Adam's momentum would move a network that had nothing to learn from.
+    """
+    had = costly.any((0, 1, 3))
+    return jax.tree.map(lambda new, old: jnp.where(had.reshape(-1, *[1] * (new.ndim - 1)), new, old), learned, net)
 
 
 def samples_of_agents(

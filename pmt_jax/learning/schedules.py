@@ -9,7 +9,9 @@ from ..config.settings import Config
 from .maths.pytree import pytree
 from .types import Hyper
 
-FEAR_LR_START = 1e-2  # learning rate of fear in the first update; in update t it is this over t, while above emotion_lr
+# Learning rate of fear in the first update, or ten times emotion_lr if that is less. In update t it is this over t,
+# while above emotion_lr.
+FEAR_LR_START = 1e-2
 
 
 @pytree
@@ -40,6 +42,6 @@ def at(config: Config, hyper: Hyper, update: jax.Array) -> Schedule:
         critic_lr=hyper.critic_lr * left,
         emotion_lr=emotion_lr,
         # A network that knows nothing yet learns faster, so that fear does not lag where danger is dense at once.
-        fear_lr=jnp.maximum(emotion_lr, FEAR_LR_START / (update + 1) * left),
+        fear_lr=jnp.maximum(emotion_lr, jnp.minimum(FEAR_LR_START, 10 * hyper.emotion_lr) / (update + 1) * left),
         kl_limit=hyper.kl_limit * left**2,
     )

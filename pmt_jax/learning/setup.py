@@ -25,10 +25,12 @@ class Trials:
 
     Attributes:
       hyper: every lane's own settings, leaves [L], or [] if all share them; seed: [L] int32.
+      index: [L] int, which of its run's seeds a lane is.
     """
 
     hyper: Hyper
     seed: jax.Array
+    index: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,6 +158,10 @@ def make_setup(
     if method.letter and config.recurrent != "none":
         raise UsageError(
             f"{label(config.method)} has the paper's networks, which remember nothing; leave out recurrent"
+        )
+    if method.constraint == "lagrangian" and not method.letter and config.lambda_max and not config.lambda_init:
+        raise UsageError(
+            "a multiplier of 0 never moves, for it changes in proportion to itself; set lambda_init above 0"
         )
     nets = networks.build(config, env.spec, method)
     vector = tasks.VectorEnv(env, config.num_envs, limit_terminates=config.time_limit == "terminate")

@@ -26,8 +26,8 @@ LEARNED = (*ACTING, "critic", "cost_critic", "fear", "largest_cost", "regret", "
 def prepare(setup: Setup) -> Change | None:
     """What turns the first state of a run [seeds] into the one that `init` asks for; None without it.
 
-    Seed i takes what the other run's seed i has learned, counted round if that run has fewer seeds. Optimisers,
-    multipliers, environments and keys begin anew.
+    Seed i (of each point of a sweep) takes what the other run's seed i has learned, counted round if that run has fewer
+    seeds. Optimisers, multipliers, environments and keys begin anew.
 
     Raises:
       UsageError: there is no such run, or its networks have other shapes.
@@ -36,7 +36,8 @@ def prepare(setup: Setup) -> Change | None:
         return None
     hyper, keys, axes = setup.vmap_arguments
     like = jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), axes), hyper, keys)
-    changes = _networks(setup.config.init, like)
+    index = setup.trials.index if setup.trials else jnp.arange(setup.config.seeds)
+    changes = _networks(setup.config.init, like, index)
 
     def change(state: LearnerState) -> LearnerState:
         parts = {name: _with(getattr(state, name), learned) for name, learned in changes.items()}
@@ -59,16 +60,17 @@ def _with(part: Any, learned: Any) -> Any:
     return dataclasses.replace(part, params=learned) if isinstance(part, TrainState) else learned
 
 
-def _networks(source: str, like: LearnerState) -> dict[str, Any]:
-    """What the other run has learned of all that both have."""
+def _networks(source: str, like: LearnerState, index: jax.Array) -> dict[str, Any]:
+    """What the other run has learned of all that both have, for the seeds at `index` [seeds] of it."""
     _, state = load_run(pathlib.Path(source))
     names = LEARNED if isinstance(state, LearnerState) else ACTING
     both = [name for name in names if None not in (getattr(state, name), getattr(like, name))]
-    return {name: _taken(source, name, _learned(getattr(state, name)), getattr(like, name)) for name in both}
+    parts = {name: (_learned(getattr(state, name)), getattr(like, name)) for name in both}
+    return {name: _taken(source, name, *part, index) for name, part in parts.items()}
 
 
-def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
-    """`theirs` [other seeds, ...] for as many seeds as the part `like` has."""
+def _taken(source: str, name: str, theirs: Any, like: Any, index: jax.Array) -> Any:
+    """`theirs` [other seeds, ...] at `index` [seeds], counted round; it must have the shapes of the part `like`."""
     like = _learned(like)
     shapes = [jax.tree.map(lambda x: x.shape[1:], tree) for tree in (theirs, like)]
     if shapes[0] != shapes[1]:
@@ -79,4 +81,4 @@ def _taken(source: str, name: str, theirs: Any, like: Any) -> Any:
             "(ippo and ippo_l have those of observations), and one fear network for all agents or one for each "
             "(f4sg_letter)"
         )
-    return jax.tree.map(lambda x, new: x[jnp.arange(new.shape[0]) % x.shape[0]], theirs, like)
+    return jax.tree.map(lambda x: x[index % x.shape[0]], theirs)

@@ -154,8 +154,13 @@ def u_test(ours: ArrayLike, theirs: ArrayLike) -> float:
 
 
 def welch_test(ours: ArrayLike, theirs: ArrayLike) -> float:
-    """The two-sided p of Welch's t test, of means of unequal variances; scores [seeds] that all agree have p 0 or 1."""
+    """The two-sided p of Welch's t test, of means of unequal variances; scores [seeds] that all agree have p 0 or 1.
+
+    With fewer than two scores on a side it is nan.
+    """
     a, b = np.asarray(ours, float), np.asarray(theirs, float)
+    if min(len(a), len(b)) < 2:
+        return float("nan")
     if not np.ptp(a) and not np.ptp(b):
         return float(a.mean() == b.mean())
     result: Any = scipy.stats.ttest_ind(a, b, equal_var=False)

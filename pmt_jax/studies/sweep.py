@@ -236,11 +236,11 @@ def _train_group(
     configs = list(group.values())
     seeds, setup = configs[0].seeds, make_setup(configs[0])
     settings = [dataclasses.replace(setup, config=config).hyper for config in configs]
-    own = jax.tree.map(lambda *each: jnp.repeat(jnp.stack(each), seeds), *settings)
-    seed = jnp.concatenate([jnp.arange(config.seed, config.seed + seeds) for config in configs])
-    trials = Trials(
-        own if len(group) > 1 else settings[0], seed
-    )  # settings that are shared keep the last bits of a run
+    own = jax.tree.map(lambda *each: jnp.repeat(jnp.stack(each), seeds, axis=0), *settings)
+    index = jnp.tile(jnp.arange(seeds), len(configs))
+    seed = index + jnp.repeat(jnp.array([config.seed for config in configs]), seeds)
+    # Settings that are shared keep the last bits of a run.
+    trials = Trials(own if len(group) > 1 else settings[0], seed, index)
     common = configs[0].replace(seeds=len(configs) * seeds, seed=0)
     begun = (folder / "run" / "config.toml").is_file()
     files = {str(file.relative_to(out)): file.read_text() for file in program_folder.point_files(folder)}

@@ -14,6 +14,12 @@ NEAR = 2.0  # times the limit: costs beyond that are not near it
 FALLING = 0.05  # share by which costs fell between the last two tenths of the steps, if they still fall
 AT_BOUND = 0.98  # share of lambda_max
 MOST_PARTS = 5  # of a list of seeds
+STRONGER = {  # what weighs a cost more
+    "lagrangian": "--lambda-lr",
+    "pid": "--lambda-lr",
+    "penalty": "--lambda-max",
+    "trust_region": "--limit-lr",
+}
 
 
 def lines(folder: pathlib.Path) -> list[str]:
@@ -61,7 +67,7 @@ def _advice(log: RunLog, beyond: Sequence[int]) -> str:
     bound = log.settings.get("lambda_max", np.inf)
     cost = log.metrics["episode_cost"][beyond]
     before, last = (_mean(cost, log.steps, begin) for begin in (0.8, 0.9))
-    held = (_multiplier(log)[beyond] >= AT_BOUND * bound) & (constraint == "lagrangian")
+    held = (_multiplier(log)[beyond] >= AT_BOUND * bound) & (constraint in ("lagrangian", "pid"))
     if held.any():
         return f"{_named(seeds[held])}: the multiplier is at its bound, lambda_max = {bound:g}; raise --lambda-max"
     falling = before - last > FALLING * np.abs(before)
@@ -85,9 +91,10 @@ def _named(seeds: np.ndarray) -> str:
 
 def _far(cost: np.ndarray, whose: str, limit: float, constraint: str) -> str:
     """What to do with seeds whose costs [S, rows] end far beyond the limit."""
-    lowest, stronger = np.nanmin(cost), "--lambda-lr" if constraint == "lagrangian" else "--limit-lr"
+    lowest, flag = np.nanmin(cost), STRONGER.get(constraint)
     near = "never came" if lowest > NEAR * limit else "came, but did not stay,"
-    return f"{whose}: costs {near} near the limit (lowest row {lowest:.3g}); raise {stronger}, or train longer"
+    advice = f"raise {flag}, or train longer" if flag else "train longer"
+    return f"{whose}: costs {near} near the limit (lowest row {lowest:.3g}); {advice}"
 
 
 def _constraint(log: RunLog) -> str:

@@ -103,16 +103,28 @@ class Csv:
     def __init__(self, out: pathlib.Path, config: Config, step: int) -> None:
         del config, step
         self._file = (out / "metrics.csv").open("w", newline="")
-        self._writer: csv.DictWriter[str] | None = None
-        self.write(read_rows(out / "metrics.jsonl"))
+        self._before: list[Row] | None = read_rows(out / "metrics.jsonl")
+        self._begin(self._before)
+
+    def _begin(self, rows: list[Row]) -> None:
+        columns = dict.fromkeys(name for row in rows for name in row)
+        self._file.seek(0)
+        self._file.truncate()
+        self._writer = csv.DictWriter(self._file, list(columns), extrasaction="ignore")
+        if columns:
+            self._writer.writeheader()
+        self._append(rows)
+
+    def _append(self, rows: list[Row]) -> None:
+        self._writer.writerows([finite(row) for row in rows])
+        self._file.flush()
 
     def write(self, rows: list[Row]) -> None:
-        if rows and self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(rows[0]), extrasaction="ignore")
-            self._writer.writeheader()
-        if self._writer:
-            self._writer.writerows([finite(row) for row in rows])
-        self._file.flush()
+        if self._before is None:
+            self._append(rows)
+        elif rows:  # a run that goes on with other settings may have other columns
+            self._begin([*self._before, *rows])
+            self._before = None
 
     def close(self) -> None:
         self._file.close()

@@ -144,7 +144,8 @@ class Trainer:
             return
         reasons = {row["seed"] - self.config.seed: row.get("broken") for row in rows}
         for i, update in enumerate(np.asarray(sharding.gather(self.state.update))):
-            if int(update) * self.config.batch_size < self.step:  # beyond int32
+            # One that an evaluation broke has no update less.
+            if reasons.get(i) or int(update) * self.config.batch_size < self.step:  # beyond int32
                 self.broken[i] = reasons.get(i) or f"seed {self.config.seed + i} broke before step {self.step:,}"
 
     # -----------------------------------------------------------------------------------------------------------------

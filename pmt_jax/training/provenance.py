@@ -62,12 +62,13 @@ class Provenance:
     def differences(self, other: Provenance) -> dict[str, str]:
         """{setting: 'ours -> theirs'} of all that differs but the steps to train.
 
-        A Python file is the same task in another folder. Trials are not compared where one of both has none.
+        A Python file is the same task or method in another folder. Trials are not compared where one of both has none.
         """
         found = differences(self.config, other.config)
-        tasks = [provenance.config.task for provenance in (self, other)]
-        if all(map(is_file, tasks)) and len({pathlib.Path(task).name for task in tasks}) == 1:
-            found.pop("task", None)
+        for field in ("task", "method"):
+            named = [getattr(provenance.config, field) for provenance in (self, other)]
+            if all(map(is_file, named)) and len({pathlib.Path(name).name for name in named}) == 1:
+                found.pop(field, None)
         if self.trials and other.trials:
             pairs = {name: (repr(x), repr(other.trials.get(name))) for name, x in self.trials.items()}
             found |= {f"{name} of the trials": f"{x} -> {y}" for name, (x, y) in pairs.items() if x != y}

@@ -98,6 +98,7 @@ train lane --lambda-max 0.1 | lambda_init = 2.0 lies above lambda_max = 0.1
 train lane --method macpo --limit-lr 3 | limit_lr must lie in [0, 1], not 3.0
 train lane --method macpo --kl-limit inf | kl_limit must be a number above 0, not inf
 train lane --lambda-init 0 | a multiplier of 0 never moves
+train lane --init ~nosuchuser/x | --init must be a path, but '~nosuchuser/x' begins with a home that is unknown
 train lane --physics= | physics = '' does not fit: expected auto | fused | mjx
 train lane --env num_agents | env = ['num_agents'] does not fit: expected name=value
 train ant_2x4 --env physics=warp | 'physics' is no option of a task; set physics = ... (--physics)

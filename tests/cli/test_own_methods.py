@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import re
+import shutil
 
 import pytest
 
@@ -56,6 +57,22 @@ def test_a_run_table_eval_and_resume(trained: pathlib.Path, cli, monkeypatch: py
     assert cli("eval", run, "--episodes", 2)[0] == 0
     code, text, _ = cli("train", run / "config.toml", "--steps", 600, "--out", run, "--resume")
     assert code == 0 and "resuming after 400 steps" in text and "doubled on lane" in text
+
+
+@pytest.mark.full
+def test_a_run_goes_on_where_its_file_has_moved(trained: pathlib.Path, tmp_path: pathlib.Path, cli):
+    """The file is the same method in another folder; config.toml says where."""
+    folder = shutil.copytree(trained, tmp_path / "moved")
+    words = ("train", "lane", "--method", f"{folder / 'mine.py'}:doubled", *TINY, "--steps", 600)
+    code, text, err = cli(*words, "--out", folder / "run", "--resume")
+    assert code == 0 and "resuming after" in text, err
+    config = folder / "run" / "config.toml"
+    config.write_text(config.read_text().replace(str(trained), str(folder)))
+    assert cli("eval", folder / "run", "--episodes", 2, "--trust")[0] == 0
+    other = folder / "other.py"
+    other.write_text(FILE)
+    code, _, err = cli(*words[:3], f"{other}:doubled", *words[4:], "--out", folder / "run", "--resume")
+    assert code == 2 and "method: " in err
 
 
 def test_a_plain_row_in_a_file_is_the_row_of_the_table(file: pathlib.Path):

@@ -35,6 +35,20 @@ def test_every_field_is_described():
     assert {field.metadata["group"] for field in fields} == set(GROUPS)
 
 
+def test_a_method_that_a_file_names_takes_its_table_of_the_file_below(tmp_path: pathlib.Path):
+    """And the options of a method's table lie over those that all methods share, one by one."""
+    (tmp_path / "base.toml").write_text(
+        'extends = "lane"\n[env]\nnum_agents = 3\n[method.f4sg]\nemotion_l2 = 7.0\n[method.f4sg.env]\nother = 2\n'
+    )
+    (tmp_path / "top.toml").write_text('extends = "base.toml"\nmethod = "f4sg"\n')
+    config = load_config(tmp_path / "top.toml")
+    assert (config.method, config.emotion_l2, dict(config.env)) == ("f4sg", 7.0, {"num_agents": 3, "other": 2})
+    assert load_config(tmp_path / "top.toml", method="happo").emotion_l2 == 1.0
+    (tmp_path / "over.toml").write_text('extends = "top.toml"\n[method.f4sg]\nclip = 0.1\n')
+    config = load_config(tmp_path / "over.toml")
+    assert (config.method, config.emotion_l2, config.clip) == ("f4sg", 7.0, 0.1)
+
+
 def test_precedence_is_defaults_file_method_table_overrides(tmp_path: pathlib.Path):
     path = tmp_path / "mine.toml"
     path.write_text('task = "lane"\nactor_lr = 1e-2\nclip = 0.3\n[method.happo]\nclip = 0.4\nepochs = 2\n')

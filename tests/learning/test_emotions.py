@@ -68,6 +68,14 @@ def test_padded_actions_have_no_regret():
     np.testing.assert_allclose(with_padding, np.log(0.8), rtol=1e-5)
 
 
+def test_an_agent_without_a_costly_step_keeps_its_regret():
+    """Though another agent had one; momentum would move it."""
+    costly = jnp.zeros((3, 4, 2, 2)).at[1, 2, 0, 1].set(1.0)
+    new, old = ({"weights": jnp.full((2, 5), x), "count": jnp.full(2, x)} for x in (1.0, 0.0))
+    kept = regret.where_costly(costly, new, old)  # pyright: ignore[reportArgumentType]
+    assert kept["weights"].sum(1).tolist() == [5.0, 0.0] and kept["count"].tolist() == [1.0, 0.0]
+
+
 def test_regret_arises_only_where_it_cost():
     logits, cost = jnp.asarray([[2.0, -1.0], [2.0, -1.0]]), jnp.asarray([[1.0], [0.0]])
     found = regret.regret(logits, cost)

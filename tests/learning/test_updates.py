@@ -143,11 +143,26 @@ def test_rates_fall_to_a_share_of_themselves_in_a_run_of_any_length(steps: int):
     np.testing.assert_allclose(held.kl_limit, setup.config.kl_limit * left**2, rtol=2e-2)
 
 
+def test_only_a_multiplier_that_moves_in_proportion_may_not_be_0():
+    for method in ("mappo_pid", "macpo", "crpo", "p3o", "mappo"):
+        make_setup(load_config("lane", method=method, lambda_init=0.0))
+    with pytest.raises(UsageError, match="a multiplier of 0 never moves"):
+        make_setup(load_config("lane", method="mappo_l", lambda_init=0.0))
+    with_none = load_config("lane", method="p3o", lambda_init=0.0, lambda_max=0.0)  # HAPPO
+    make_setup(with_none)
+
+
 def test_fears_first_learning_rate_falls_with_the_updates():
     setup = make_setup(load_config("lane", method="mixed", num_envs=128, rollout_length=64))
     hyper = dataclasses.replace(setup.hyper, emotion_lr=jnp.float32(3e-3))
-    rates = jax.vmap(lambda update: schedules.at(setup.config, hyper, update).fear_lr)
+
+    def rates(update: jax.Array) -> jax.Array:
+        return jax.vmap(lambda update: schedules.at(setup.config, hyper, update).fear_lr)(update)
+
     np.testing.assert_allclose(rates(jnp.asarray([0, 1, 3], jnp.int32)), [1e-2, 5e-3, 3e-3], rtol=1e-6)
+    for start in (0.0, 1e-4):  # fear that is to learn slowly or not at all does
+        hyper = dataclasses.replace(hyper, emotion_lr=jnp.float32(start))
+        np.testing.assert_allclose(rates(jnp.asarray([0, 1, 99], jnp.int32)), [10 * start, 5 * start, start], rtol=1e-6)
 
 
 @pytest.mark.full

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import shutil
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from pmt_jax import load_config, make_train
 from pmt_jax.errors import UsageError
 from pmt_jax.learning import learner
-from pmt_jax.learning.setup import Setup, make_setup
+from pmt_jax.learning.setup import Setup, Trials, make_setup
 from pmt_jax.learning.types import LearnerState
 from pmt_jax.policies import load, warm_start
 from runs import ARGUMENTS, STEPS, rows
@@ -55,6 +56,16 @@ def test_networks_and_moments_are_the_other_runs_and_all_else_is_new(whole: path
     chex.assert_trees_all_equal(state.state_moments, jax.tree.map(lambda x: x[turn], other.state_moments))
     for name in ("constraint", "rollout", "key", "update"):
         chex.assert_trees_all_equal(getattr(state, name), getattr(fresh, name))
+
+
+def test_each_point_of_a_sweep_begins_with_the_same_seeds(whole: pathlib.Path):
+    """However many of one program come before it."""
+    _, other = load.load_run(whole)
+    assert isinstance(other, LearnerState)
+    setup, fresh = first(seeds=3, init=str(whole))
+    trials = Trials(setup.hyper, jnp.arange(3), index=jnp.zeros(3, int))  # three points of a seed
+    state = started(dataclasses.replace(setup, trials=trials), fresh)
+    chex.assert_trees_all_equal(state.actor.params, jax.tree.map(lambda x: x[np.zeros(3, int)], other.actor.params))
 
 
 @pytest.mark.full

@@ -100,6 +100,7 @@ def test_welchs_test_agrees_with_its_interval():
     x, y = np.array([1.0, 2, 4, 8]), np.array([5.0, 6, 6, 9, 11])
     low, high = statistics.difference_interval(x, y, 1 - statistics.welch_test(x, y))
     assert min(abs(low), abs(high)) < 1e-6
+    assert np.isnan(statistics.welch_test([1], [2, 3]))
     assert statistics.welch_test([1, 1], [1, 1]) == 1 and statistics.welch_test([1, 1], [2, 2]) == 0
 
 

@@ -198,6 +198,40 @@ def test_what_is_traced_shares_a_program_and_what_is_static_does_not(tmp_path: p
     assert all(len({c.method for c in group}) == 1 for group in groups)
 
 
+TWO_COSTS = """
+import dataclasses
+import jax.numpy as jnp
+from envs.toys import Lane
+
+class Two(Lane):
+    def __init__(self):
+        super().__init__()
+        self.spec = dataclasses.replace(self.spec, name="two", num_costs=2, cost_limit=(2.0, 3.0))
+
+    def _both(self, state):
+        return dataclasses.replace(state, cost=jnp.concatenate([state.cost, 0 * state.cost], 1))
+
+    def reset(self, key):
+        return self._both(super().reset(key))
+
+    def step(self, state, action):
+        return self._both(super().step(dataclasses.replace(state, cost=state.cost[:, :1]), action))
+"""
+
+
+def test_points_keep_the_limits_of_several_costs(tmp_path: pathlib.Path, monkeypatch, cli):
+    """Every lane has its own settings, a number for each cost, and its seed's place in its run."""
+    asked = []
+    monkeypatch.setattr(sweep.trainer, "train", lambda *_, **how: asked.append(how["trials"]) or 1)
+    (tmp_path / "two.py").write_text(TWO_COSTS)
+    words = ("--set", "clip=0.1,0.2", "--seeds", 3, "--num-envs", 4, "--minibatches", 1)
+    cli("sweep", tmp_path / "two.py", *words, "--out", tmp_path / "out")
+    (trials,) = asked
+    np.testing.assert_array_equal(trials.hyper.cost_limit, [[2.0, 3.0]] * 6)
+    np.testing.assert_allclose(trials.hyper.clip, np.repeat([0.1, 0.2], 3), rtol=1e-6)
+    assert trials.index.tolist() == trials.seed.tolist() == [0, 1, 2] * 2
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # The paper's tables
 
@@ -351,6 +385,20 @@ def test_a_file_lists_parts(tmp_path: pathlib.Path, monkeypatch, cli):
     assert {config.num_envs for config in seen.values()} == {16}  # the command line has the last word
     assert [config.steps for config in seen.values()] == [4800] * 4 + [9600] * 2
     assert seen[lanes[0]].activation == "tanh"  # as lane in configs/tasks.toml says
+
+
+@pytest.mark.parametrize(
+    ("file", "part"),
+    [
+        ("[method.f4sg]\nemotion_l2 = 7.0", 'method = ["mappo_l", "f4sg"]'),
+        ("[method.f4sg]\nemotion_l2 = 7.0", 'set.method = ["mappo_l", "f4sg"]'),
+        ("", '[sweep.method.f4sg]\nemotion_l2 = 7.0\n[sweep.set]\nmethod = ["mappo_l", "f4sg"]'),
+    ],
+)
+def test_tables_of_methods_hold_however_the_methods_are_named(file: str, part: str, tmp_path: pathlib.Path):
+    (tmp_path / "study.toml").write_text(f'extends = "lane"\n{file}\n[sweep]\n{part}\n')
+    found = points.make_points(points.from_file(tmp_path / "study.toml"))
+    assert {config.method: config.emotion_l2 for config in found.values()} == {"mappo_l": 1.0, "f4sg": 7.0}
 
 
 @pytest.mark.parametrize("file", ["base.toml", "deeper/base.toml"])

@@ -217,7 +217,7 @@ def test_a_checkpoint_that_does_not_say_what_it_belongs_to(copy: pathlib.Path, c
 def test_the_trials_of_a_sweep_belong_to_its_checkpoint():
     setup = make_setup(load_config("lane", "mappo_l", num_envs=4, seeds=2))
     hyper = setup.hyper
-    trials = [Trials(hyper, jnp.array(seeds)) for seeds in ([0, 1], [0, 2])]
+    trials = [Trials(hyper, jnp.array(seeds), jnp.arange(2)) for seeds in ([0, 1], [0, 2])]
     ours, theirs = (Provenance.of(type(setup)(setup.config, *_rest(setup), trials=x)) for x in trials)
     assert ours.differences(theirs) == {"seed of the trials": "[0, 1] -> [0, 2]"} and not ours.differences(ours)
     step, back = Provenance.from_bytes(ours.to_bytes(400))

@@ -139,6 +139,10 @@ CASES = {
     "in a row": (log_of([FLAT - x for x in (0, 0, 0, 1, 0, 0, 1, 0)]), "2 of 8", "seeds 0 to 2, 4, 5, 7: costs stay"),
     "no constraint": (log_of([FLAT], method="mappo"), "0 of 1", "mappo has no constraint"),
     "trust region": (log_of([FLAT + 4], method="macpo"), "0 of 1", "raise --limit-lr"),
+    "pid": (log_of([FLAT + 4], method="mappo_pid"), "0 of 1", "raise --lambda-lr"),
+    "pid at its bound": (log_of([FLAT], multiplier=20.0, method="mappo_pid"), "0 of 1", "raise --lambda-max"),
+    "penalty": (log_of([FLAT + 4], method="p3o"), "0 of 1", "raise --lambda-max"),
+    "switching": (log_of([FLAT + 4], method="crpo"), "0 of 1", "(lowest row 5.3); train longer"),
     "by its noise": (log_of([FLAT], deployed=[0.2]), "; by 1 of 1 seed under mean actions", "keeps the limit"),
     "no episode": (
         log_of([FLAT * np.nan], deployed=[3.0]),

@@ -70,6 +70,16 @@ def test_one_seed_breaks_and_the_other_trains_on(whole: pathlib.Path, tmp_path: 
     shutil.rmtree(out / "checkpoints" / str(STEPS))
 
 
+def test_a_seed_that_an_evaluation_broke_does_not_train_on(tmp_path: pathlib.Path, cli, monkeypatch):
+    """Its state is whole and has no update less."""
+    monkeypatch.setattr(health, "diagnose_evaluation", lambda setup, row: "too much" if row["step"] >= 400 else None)
+    command = ("train", *ARGUMENTS, "--steps", STEPS, "--out", tmp_path / "run")
+    for more in ((), ("--resume",)):
+        code, text, _ = cli(*command, *more)
+        assert code == 1 and "stopped: too much" in text
+        assert [(row["step"], row["broken"]) for row in rows(tmp_path / "run")[-2:]] == [(400, "too much")] * 2
+
+
 def test_a_worker_that_is_lost_after_a_seed_broke_costs_one_chunk(tmp_path: pathlib.Path, cli, monkeypatch):
     breaking(monkeypatch, {1: 3})
     evaluate = trainer.Trainer.evaluate

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import pathlib
 import re
 import signal
@@ -14,7 +15,8 @@ import types
 import pytest
 from rich.console import Console
 
-from pmt_jax.training import metrics, progress
+from pmt_jax import load_config
+from pmt_jax.training import loggers, metrics, progress
 from pmt_jax.training.progress import COLUMNS, Progress
 from runs import ARGUMENTS, STEPS, assert_same_run, rows, stop_after_rows
 
@@ -36,6 +38,22 @@ def test_csv_and_tensorboard_and_a_profile(whole: pathlib.Path, tmp_path: pathli
     assert sorted(p.name for p in (out / "tensorboard").iterdir()) == ["seed0", "seed1"]
     assert list((tmp_path / "trace").rglob("*.xplane.pb"))
     assert_same_run(out, whole)
+
+
+def test_a_run_that_goes_on_otherwise_has_all_its_columns(tmp_path: pathlib.Path):
+    """Rows of before lack some that come with an evaluation."""
+    config = load_config("lane")
+    for first in ([], [{"step": 100, "cost": 1.0}, {"step": 200, "cost": 2.0}]):
+        (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in first))
+        log = loggers.Csv(tmp_path, config, 200)
+        assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["100,1.0", "200,2.0"][: len(first)]
+        for step in (300, 400):
+            log.write([{"step": step, "cost": 3.0, "eval/cost": 0.5}])
+        log.close()
+        with (tmp_path / "metrics.csv").open(newline="") as file:
+            table = list(csv.DictReader(file))
+        assert [row["step"] for row in table] == [*["100", "200"][: len(first)], "300", "400"]
+        assert [row["eval/cost"] for row in table] == [*["", ""][: len(first)], "0.5", "0.5"]
 
 
 def test_weights_and_biases_without_a_network(tmp_path: pathlib.Path, cli, monkeypatch):
