@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ..config.settings import Config
 from ..errors import UsageError
 from ..learning import learner, sharding
 from ..learning.setup import Setup
@@ -20,6 +21,7 @@ from .load import load_run
 Change = Callable[[LearnerState], LearnerState]
 
 ACTING = ("actor", "obs_moments")  # a pretrained policy has no more
+FUNCTION = ("activation", "obs_norm")  # with other ones the same weights are another function
 LEARNED = (*ACTING, "critic", "cost_critic", "fear", "largest_cost", "regret", "state_moments")
 
 
@@ -30,14 +32,14 @@ def prepare(setup: Setup) -> Change | None:
     seeds. Optimisers, multipliers, environments and keys begin anew.
 
     Raises:
-      UsageError: there is no such run, or its networks have other shapes.
+      UsageError: there is no such run, or its networks are of another kind.
     """
     if not setup.config.init:
         return None
     hyper, keys, axes = setup.vmap_arguments
     like = jax.eval_shape(jax.vmap(functools.partial(learner.init, setup), axes), hyper, keys)
     index = setup.trials.index if setup.trials else jnp.arange(setup.config.seeds)
-    changes = _networks(setup.config.init, like, index)
+    changes = _networks(setup.config, like, index)
 
     def change(state: LearnerState) -> LearnerState:
         parts = {name: _with(getattr(state, name), learned) for name, learned in changes.items()}
@@ -60,9 +62,14 @@ def _with(part: Any, learned: Any) -> Any:
     return dataclasses.replace(part, params=learned) if isinstance(part, TrainState) else learned
 
 
-def _networks(source: str, like: LearnerState, index: jax.Array) -> dict[str, Any]:
-    """What the other run has learned of all that both have, for the seeds at `index` [seeds] of it."""
-    _, state = load_run(pathlib.Path(source))
+def _networks(config: Config, like: LearnerState, index: jax.Array) -> dict[str, Any]:
+    """What the run that `config` names has learned of all that both have, for the seeds at `index` [seeds] of it."""
+    source = config.init
+    made, state = load_run(pathlib.Path(source))
+    for name in FUNCTION:
+        if (given := getattr(made.config, name)) != getattr(config, name):
+            flag = f"--{name.replace('_', '-')} {given}"
+            raise UsageError(f"the networks of {source} have {name} = '{given}', this run's do not; add {flag}")
     names = LEARNED if isinstance(state, LearnerState) else ACTING
     both = [name for name in names if None not in (getattr(state, name), getattr(like, name))]
     parts = {name: (_learned(getattr(state, name)), getattr(like, name)) for name in both}

@@ -102,6 +102,11 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_there_again(
     ("changes", "said"),
     [
         ({"init": "nowhere"}, "nowhere is not a run folder"),
+        (
+            {"init": "{whole}", "activation": "relu"},
+            "= 'tanh', this run's do not; add --activation tanh",
+        ),
+        ({"init": "{whole}", "obs_norm": "none"}, "this run's do not; add --obs-norm "),
         ({"init": "{whole}", "hidden": "16"}, "actor of {whole} has other shapes than this run's"),
         ({"init": "{whole}", "method": "f4sg_letter"}, "fear of {whole} has other shapes than this run's"),
     ],
