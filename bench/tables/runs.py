@@ -78,11 +78,11 @@ def _compact(log: RunLog, points: int) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
-    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost's curve, whose
-    points count alike, and what the last evaluation found, the one that ended the run if there was one.
+    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost over all rows,
+    which count alike, and what the last evaluation found, the one that ended the run if there was one.
     """
     found, (row,) = log.thinned(points), rows([log])
-    scores = row.scores | {WHILE_TRAINING: np.nanmean(found.metrics["episode_cost"], axis=1)}
+    scores = row.scores | {WHILE_TRAINING: np.nanmean(log.metrics["episode_cost"], axis=1)}
     if "true_step_cost" in log.metrics:
         scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
     evaluated = np.isfinite(log.metrics.get("eval/episode_cost", np.empty((0, 0)))).any(0)

@@ -149,14 +149,22 @@ def as_equivalence(files: pathlib.Path) -> str:
 
 
 def _until(run: runs.Run, end: int) -> dict[str, Scores]:
-    """The measures as if the run had ended at step `end`: harm until then, cost and reward of the last tenth."""
+    """The measures as if the run had ended at step `end`: harm until then, cost and reward of the last tenth.
+
+    A point of a curve counts by the steps that it is the mean of.
+    """
     steps = np.array(run["steps"])
     until, last = steps <= end, (steps <= end) & (steps > 0.9 * end)
-    curves = {name: np.array(run[name], float) for name in ("true_step_cost", "true_episode_cost", "episode_reward")}
+
+    def mean(name: str, chosen: NDArray[np.bool_]) -> Scores:
+        curve = np.array(run[name], float)[:, chosen]
+        weights = np.where(np.isfinite(curve), np.diff(steps, prepend=0)[chosen], 0)
+        return np.nansum(curve * weights, 1) / weights.sum(1)
+
     return {
-        "training": 1000 * np.nanmean(curves["true_step_cost"][:, until], 1),
-        "end": np.nanmean(curves["true_episode_cost"][:, last], 1),
-        "reward": np.nanmean(curves["episode_reward"][:, last], 1),
+        "training": 1000 * mean("true_step_cost", until),
+        "end": mean("true_episode_cost", last),
+        "reward": mean("episode_reward", last),
     }
 
 
