@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import pathlib
@@ -76,8 +77,10 @@ def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
     try:
         partial.mkdir(parents=True)
         yield partial
-        if not out.exists() or not any(out.iterdir()):
+        if not out.exists():
             partial.rename(out)
+        elif not out.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
         else:
             for file in partial.iterdir():
                 file.replace(out / file.name)

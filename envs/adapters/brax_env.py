@@ -53,5 +53,5 @@ class BraxEnv(brax_envs.Env):
             "obs": state.obs.ravel(),
             "reward": state.reward,
             "done": state.terminated.astype(state.reward.dtype),
-            "metrics": {"cost": state.cost.sum(-1).mean(), **state.info},
+            "metrics": {**state.info, "cost": state.cost.sum(-1).mean()},
         }

@@ -64,7 +64,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
         self._state = state = self._reset(key(self.np_random))
         self._waiting[:] = False
         start = owned(state.env)
-        return start.obs, {"global_state": start.global_state, "cost": start.cost, **start.info}
+        return start.obs, {**start.info, "global_state": start.global_state, "cost": start.cost}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One control step of all environments with `actions` [num_envs, N, A].
@@ -78,7 +78,7 @@ class GymnasiumVector(gymnasium.vector.VectorEnv):
         self._state, happened, start = self._step(self._state, self._waiting, joint)
         happened, start = owned(happened), owned(start)
         done = happened.terminated | happened.truncated
-        info = {"cost": happened.cost, **happened.info}
+        info = {**happened.info, "cost": happened.cost}
         if self._mode is AutoresetMode.NEXT_STEP:
             self._waiting = done
             shown, state = happened.next_obs, happened.next_global_state

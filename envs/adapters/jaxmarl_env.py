@@ -110,7 +110,7 @@ class JaxMarlEnv:
         if reset_state is not None:
             begun = JaxMarlState.of(_plain(reset_state), after.last_obs, after.last_global_state)
             after = jax.tree.map(lambda x, y: jnp.where(done, x, y), begun, after)
-        each = {"truncated": happened.truncated, **happened.info}
+        each = {**happened.info, "truncated": happened.truncated}
         infos = {name: jnp.broadcast_to(x, (self.num_agents,)) for name, x in each.items()}
         infos["cost"] = happened.cost.sum(-1)
         if happened.cost.shape[-1] > 1:

@@ -113,4 +113,4 @@ class PettingZooParallel(pettingzoo.ParallelEnv):
 
     def _infos(self, cost: np.ndarray, info: dict[str, Any]) -> ByAgent:
         shared = {name: float(x) for name, x in info.items()}
-        return {agent: {"cost": row, **shared} for agent, row in self._each(cost).items()}
+        return {agent: {**shared, "cost": row} for agent, row in self._each(cost).items()}

@@ -142,7 +142,10 @@ def check_cache() -> Finding:
     """What the persistent compile cache holds, and whether one process finds what another has put into one."""
     from ..training.compile import cache_folder
 
-    place = cache_folder()
+    try:
+        place = cache_folder()
+    except RuntimeError as error:
+        return Finding("no", "compile cache", f"there is no place for it ({error}), so every start compiles anew")
     programs = list(place.glob("*-cache")) if place.is_dir() else []
     holds = f"{place} holds {len(programs)} programs, {sum(p.stat().st_size for p in programs) / 1e6:.1f} MB"
     if not os.access(next(p for p in (place, *place.parents) if p.exists()), os.W_OK):

@@ -45,7 +45,7 @@ def write(name: str, steps: dict[str, Any]) -> None:
     spaces = optional("gymnasium", "minari").spaces
     create = optional("minari.utils", "minari").create_dataset_from_buffers
     buffer = optional("minari.data_collector", "minari").EpisodeBuffer
-    infos = ["cost", "true_cost", *(x for x in steps if x.startswith("info/"))]
+    infos = [*(x for x in steps if x.startswith("info/")), "cost", "true_cost"]  # the last of a name counts
     episodes = []
     for i, seed in enumerate(steps["seed"]):
         for j, length in enumerate(steps["length"][i]):

@@ -56,7 +56,7 @@ def publish(folder: pathlib.Path, episodes: int) -> dict[str, Any]:
         "seed": row["seed"],
         "which": which,
         "step": row["step"],
-        "cost_limit": row["cost_limit"],
+        **run.limits.columns,
         "unpacked": _chosen_by(row),
         "packed": _chosen_by(evaluate_states(run, packed, episodes, deterministic=True, fresh=False)[0]),
         "action_change": action_change(run, packed, state),

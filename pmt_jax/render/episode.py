@@ -138,7 +138,8 @@ def _whole(setup: Setup, seed: int, moments: dict[str, Any]) -> Episode:
     moments["cost"] = costs.mean(1)
     sums = {"reward_sum": moments["reward"].cumsum(), "cost_sum": costs.cumsum(0).max(1)}
     steps = np.arange(len(broken))
-    whole = Episode(setup.vector.env, setup.label, seed, setup.limits, step=steps, **moments, **sums)
+    limits = setup.limits.true(setup.config.cost_seen)  # as the costs are
+    whole = Episode(setup.vector.env, setup.label, seed, limits, step=steps, **moments, **sums)
     return whole.cut(slice(length))
 
 

@@ -19,6 +19,7 @@ from .network_map import INK, PAPER
 FORMATS = (".mp4", ".gif", ".html")
 SIZE = (640, 360)  # pixels
 COLOURS = 48  # of a GIF
+GIF_FPS = 50  # readers show shorter frames than 20 ms as they like
 DANGER = (200, 64, 47)
 
 
@@ -51,6 +52,8 @@ def render(
     """
     if out.suffix not in FORMATS:
         raise UsageError(f"cannot write {out}: its ending must be .mp4, .gif or .html")
+    if out.suffix == ".gif" and fps > GIF_FPS:
+        raise UsageError(f"a GIF shows at most {GIF_FPS} frames a second, not {fps:g}; lower --fps, or write an .mp4")
     check_writable(out)
     if out.suffix == ".mp4":
         optional("imageio_ffmpeg", "render")
@@ -68,7 +71,7 @@ def render(
             )
             partial.write_text(page.page(title, [head, page.replay(episode, fps)]))
         else:
-            _write_film(_captioned(episode, _frames(episode, size)), partial, fps, size)
+            _write_film(_captioned(episode, _frames(episode, size)), len(episode), partial, fps, size)
     say(f"wrote {out}: {np.count_nonzero(episode.step)} control steps of {task}, {costly} of them with a cost")
 
 
@@ -113,14 +116,20 @@ def _captioned(episode: Episode, frames: Iterator[np.ndarray]) -> Iterator[np.nd
         yield np.asarray(picture)
 
 
-def _write_film(frames: Iterator[np.ndarray], out: pathlib.Path, fps: float, size: tuple[int, int]) -> None:
+def durations(count: int, fps: float) -> list[int]:
+    """[count] ms that a GIF shows each frame; it counts in 10 ms, so that some are longer for the mean to be right."""
+    ends = [round(100 * frame / fps) for frame in range(count + 1)]
+    return [10 * (end - begin) for begin, end in zip(ends, ends[1:], strict=False)]
+
+
+def _write_film(frames: Iterator[np.ndarray], count: int, out: pathlib.Path, fps: float, size: tuple[int, int]) -> None:
     if out.suffix == ".gif":
         from PIL import Image
 
         # Few colours and no dithering: what does not move stays equal from frame to frame, and costs no bytes.
         pictures = (Image.fromarray(f).quantize(COLOURS, dither=Image.Dither.NONE) for f in frames)
         first = next(pictures)
-        first.save(out, save_all=True, append_images=pictures, duration=1000 / fps, loop=0, optimize=True)
+        first.save(out, save_all=True, append_images=pictures, duration=durations(count, fps), loop=0, optimize=True)
         return
     ffmpeg = optional("imageio_ffmpeg", "render").get_ffmpeg_exe()
     taken = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps:g} -i -"

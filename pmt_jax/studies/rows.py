@@ -87,7 +87,7 @@ class TableRow:
       true_limits: on true costs; None if unknown.
       faults: which steps broke the contract of tasks, in a sentence; empty if none did.
       deployed: `reward`, `cost` (of the worst agent) and `beyond` [seeds] of the evaluations under mean actions that
-        ended the runs; empty if none has one.
+        ended the runs, and `evaluated`, whether there was one; a seed that broke has nan. Empty if no run has one.
     """
 
     task: str
@@ -185,13 +185,15 @@ def _deployed(group: Group) -> dict[str, np.ndarray]:
         return np.concatenate([other if x is None else x for x, other in zip(found, unknown, strict=True)])
 
     def cost(end: RunLog) -> np.ndarray | None:
-        worst = end.final(f"episode_cost{WORST}")
-        return end.final("episode_cost") if worst is None else worst
+        name = "true_episode_cost" if end.judges_true_costs else "episode_cost"
+        worst = end.final(f"{name}{WORST}")
+        return end.final(name) if worst is None else worst
 
     return {
         "reward": joined(lambda end: end.final("episode_reward")),
         "cost": joined(cost),
         "beyond": joined(lambda end: end.excess),
+        "evaluated": np.concatenate([np.full(len(run.seeds), bool(run.deployed)) for run in group.runs]),
     }
 
 

@@ -9,8 +9,9 @@ import collections
 import dataclasses
 import json
 import math
+import os
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -111,16 +112,17 @@ class RunLog:
     @property
     def excess(self) -> np.ndarray:
         """[S] how far a seed's costs at the end (see `final`) are beyond their limits, the agent and cost furthest."""
-        name = "true_episode_cost" if self._judges_true_costs else "episode_cost"
+        name = "true_episode_cost" if self.judges_true_costs else "episode_cost"
         return self.judged_limits.excess(self._costs(name))
 
     @property
     def judged_limits(self) -> Limits:
         """The limits that `excess` is beyond: on true costs, where not all of one cost is observed (`cost_seen`)."""
-        return self.true_limits if self._judges_true_costs else self.limits
+        return self.true_limits if self.judges_true_costs else self.limits
 
     @property
-    def _judges_true_costs(self) -> bool:
+    def judges_true_costs(self) -> bool:
+        """Whether not all of one cost is observed, and the true ones are known."""
         several = len(self.limits.each) > 1
         return self.settings.get("cost_seen", 1.0) < 1 and not several and "true_episode_cost" in self.metrics
 
@@ -199,7 +201,8 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
         if not path.exists():
             raise UsageError(f"{path} is not a run folder: there is no such folder")
         begun = _under_way(path, note)  # first: what ends meanwhile is then found in both places
-        folders = list(_folders(path))
+        folders, unfinished = _folders(path)
+        reasons += unfinished
         logs += [log for log in begun if all(log.folder != other.folder for other in logs)]
         if not folders and not begun:
             reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
@@ -218,12 +221,24 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
     return logs
 
 
-def _folders(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """The run folders at and below `path`; hidden folders are left out."""
-    for file in sorted(path.rglob("metrics.jsonl")):
-        hidden = any(part.startswith(".") for part in file.parent.relative_to(path).parts)
-        if not hidden and (file.parent / "config.toml").is_file():
-            yield file.parent
+def _folders(path: pathlib.Path) -> tuple[list[pathlib.Path], list[str]]:
+    """The run folders at and below `path`, also behind links, and why others that look like one are none.
+
+    Hidden folders are left out.
+    """
+    found, reasons, met = [], [], set()
+    for folder, inner, files in os.walk(path, followlinks=True):
+        if (real := os.path.realpath(folder)) in met:  # a link to a folder above it
+            inner.clear()
+            continue
+        met.add(real)
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        missing = [name for name in ("config.toml", "metrics.jsonl") if name not in files]
+        if not missing:
+            found.append(pathlib.Path(folder))
+        elif len(missing) == 1 and folder != str(path):
+            reasons.append(f"{folder} is no run folder: it has no {missing[0]}")
+    return sorted(found), reasons
 
 
 def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:

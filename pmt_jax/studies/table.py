@@ -83,13 +83,13 @@ def summarise(table: Sequence[TableRow], baseline: str | None = None) -> list[di
         cost, against = row.score(compared(table)[1]), comparisons.get((row.task, row.label))
         given = numbers.get(row.task, {})
         data: dict[str, Any] = {"task": row.task, "method": row.method, "settings": row.settings}
-        data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, KEY: row.limits.total}
+        data |= {"seeds": len(cost), "steps": row.steps, "source": row.source, KEY: _finite(row.limits.total)}
         data |= {c.name: _estimate(row.scores[c.name], c) for c in shown(table) if c.name in row.scores}
         data |= {"within": float((row.beyond <= 0).mean()), "worst": _finite(cost.max())}
         if row.deployed:
             measured = {name: _estimate(row.deployed[name], DEPLOYED[name]) for name in DEPLOYED}
-            known = row.deployed["beyond"][np.isfinite(row.deployed["beyond"])]
-            data["mean_actions"] = {**measured, "within": int((known <= 0).sum()), "seeds": len(known)}
+            beyond = row.deployed["beyond"][row.deployed["evaluated"]]  # a seed that broke is not within
+            data["mean_actions"] = {**measured, "within": int((beyond <= 0).sum()), "seeds": len(beyond)}
         data |= {"better": against and against.better, "p": against and against.p}
         reported = given.get(row.method, {})
         data["paper"] = {"table": given.get("table"), "source": given.get("source"), "rerun": {}, **reported}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+import shlex
 from collections.abc import Sequence
 
 import numpy as np
@@ -72,7 +73,7 @@ def _advice(log: RunLog, beyond: Sequence[int]) -> str:
         return f"{_named(seeds[held])}: the multiplier is at its bound, lambda_max = {bound:g}; raise --lambda-max"
     falling = before - last > FALLING * np.abs(before)
     if falling.any():
-        more = f"--steps {2 * int(log.steps[-1]):g} --out {log.folder} --resume"
+        more = f"--steps {2 * int(log.steps[-1]):g} --out {shlex.quote(str(log.folder))} --resume"
         fell = f"costs were still falling ({before[falling].mean():.3g} to {last[falling].mean():.3g})"
         return f"{_named(seeds[falling])}: {fell}; train on: {more}"
     far = last > NEAR * limit

@@ -61,9 +61,13 @@ def cache_folder() -> pathlib.Path:
 
 
 def use_cache() -> None:
-    """Keeps compiled programs in `cache_folder()`."""
+    """Keeps compiled programs in `cache_folder()`; nowhere if the user has no home."""
     if not getattr(jax.config, "jax_compilation_cache_dir", None):
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        try:
+            folder = cache_folder()
+        except RuntimeError:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

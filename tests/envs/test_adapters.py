@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import importlib.util
 import os
 import pickle
 import re
@@ -396,6 +397,40 @@ def test_pettingzoo_agents_have_the_actions_they_have_and_get_their_costs():
     for _ in range(HORIZON - 1):
         *_, truncated, infos = parallel.step({"agent_0": [1.0, 1.0], "agent_1": [1.0]})
     assert all(truncated.values()) and parallel.agents == [] and infos["agent_1"]["cost"] == [1]
+
+
+class Priced(Lane):
+    """Its `info` has names that adapters use."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = super().step(state, action)
+        return dataclasses.replace(after, info=self._named(after.info))
+
+    def reset(self, key: jax.Array) -> State:
+        start = super().reset(key)
+        return dataclasses.replace(start, info=self._named(start.info))
+
+    def _named(self, info: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return info | dict.fromkeys(("cost", "truncated", "global_state"), jnp.asarray(7.5))
+
+
+def test_no_name_of_a_task_hides_costs_and_ends():
+    env, full, key = Priced(), jnp.ones((2, 2)), jax.random.PRNGKey(0)
+    team = adapters.to_brax(env)
+    assert team.step(team.reset(key), full.ravel()).metrics["cost"] <= 1
+    agents = adapters.to_jaxmarl(env)
+    _, state = agents.reset(key)
+    infos = agents.step(key, state, dict.fromkeys(agents.agents, full[0]))[-1]
+    assert infos["cost"].max() <= 1 and not infos["truncated"].any()
+    if importlib.util.find_spec("gymnasium"):
+        vector = adapters.to_gymnasium(env, 3)
+        _, info = vector.reset(seed=0)
+        assert info["cost"].shape == (3, 2, 1) and info["global_state"].shape == (3, 6)
+        assert vector.step(np.ones((3, 2, 2), np.float32))[-1]["cost"].shape == (3, 2, 1)
+    if importlib.util.find_spec("pettingzoo"):
+        parallel = adapters.to_pettingzoo(env)
+        _, infos = parallel.reset(seed=0)
+        assert infos["agent_0"]["cost"].shape == (1,)
 
 
 @pytest.mark.full

@@ -208,7 +208,7 @@ def test_what_is_remembered_can_be_read_and_taken_back(place: pathlib.Path, cli)
     assert "add --trust" in cli("eval", "run")[2]
 
 
-def test_an_export_appears_whole(place: pathlib.Path):
+def test_an_export_appears_whole(place: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
     from pmt_jax.files import writing_folder
 
     out = place / "policy"
@@ -219,6 +219,12 @@ def test_an_export_appears_whole(place: pathlib.Path):
     with writing_folder(out) as partial:
         (partial / "one").write_text("1")
     (out / "mine").touch()
+    empty = place / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    with writing_folder(pathlib.Path()) as partial:  # the folder that a shell is in
+        (partial / "one").touch()
+    assert pathlib.Path("one").is_file() and [p.name for p in empty.iterdir()] == ["one"]
     with writing_folder(out) as partial:
         (partial / "one").write_text("2")
     assert (out / "one").read_text() == "2" and sorted(p.name for p in out.iterdir()) == ["mine", "one"]

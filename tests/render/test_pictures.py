@@ -18,7 +18,7 @@ import headless
 from by_hand import row, written
 from envs.base import Declarations, Scene
 from envs.voltage.layout import layout
-from pmt_jax import tasks
+from pmt_jax import load_config, make_setup, tasks
 from pmt_jax.errors import UsageError
 from pmt_jax.limits import Limits
 from pmt_jax.render import episode, film, gl, network_map, page, report
@@ -221,6 +221,22 @@ def test_a_film_of_the_grid(grid: episode.Episode, tmp_path: pathlib.Path, monke
     assert [p.name for p in tmp_path.iterdir()] == ["grid.gif"]
 
 
+def test_an_episode_has_the_limit_of_its_true_costs():
+    """Whatever share of them the team noticed."""
+    setup = make_setup(load_config("lane", cost_seen=0.1))
+    moments = {"raw": {}, "reward": np.zeros(3), "cost": np.ones((3, 2)), "info": {}, "action": np.zeros((3, 2, 2))}
+    found = episode._whole(setup, 0, moments | {"terminated": np.zeros(3, bool)})
+    assert str(found.limits) == "1" and found.cost_sum.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("fps", [0.5, 7, 20, 30, 40, 50])
+def test_a_gif_shows_as_many_frames_a_second_as_asked_for(fps: float):
+    """Its times are whole hundredths of a second."""
+    shown = film.durations(200, fps)
+    assert len(shown) == 200 and all(ms % 10 == 0 and ms >= 20 for ms in shown)
+    np.testing.assert_allclose(np.cumsum(shown), 1000 / fps * np.arange(1, 201), atol=5.01)
+
+
 @pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="which OpenGL there is depends on the machine")
 def test_a_film_of_the_ant(ant: episode.Episode, tmp_path: pathlib.Path, monkeypatch):
@@ -362,6 +378,10 @@ def test_a_replay_plays_scrubs_and_flags_the_cost(pages: pathlib.Path, tab: head
     ("arguments", "says"),
     [
         (["render", "none"], "none is not a run folder"),
+        (
+            ["render", "RUN", "-o", "x.gif", "--fps", "60"],
+            "a GIF shows at most 50 frames a second, not 60",
+        ),
         (["render", "RUN", "-o", "x.avi"], "cannot write x.avi: its ending must be .mp4, .gif or .html"),
         (["render", "RUN", "-o", "x.gif"], "task 'lane' has no film; write a page instead: -o replay.html"),
         (["render", "RUN", "--seed", "7"], "has no seed 7; it has 0, 1"),

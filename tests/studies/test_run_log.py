@@ -106,6 +106,21 @@ def test_folders_of_runs_are_searched_and_what_is_no_run_is_left_out(tmp_path: p
     assert all(note.startswith("left out: ") for note in notes)
 
 
+def test_runs_behind_links_are_found_once_and_unfinished_ones_named(tmp_path: pathlib.Path):
+    scratch = tmp_path / "scratch"
+    made(scratch / "a", "lane", "happo", {0: [1, 1]})
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    (runs / "linked").symlink_to(scratch)
+    (runs / "linked" / "round").symlink_to(runs)  # a circle
+    for name in ("config.toml", "metrics.jsonl"):
+        (runs / name.split(".")[0]).mkdir()
+        (runs / name.split(".")[0] / name).touch()
+    notes: list[str] = []
+    assert [log.folder for log in run_log.read_all([runs], notes.append)] == [runs / "linked" / "a"]
+    assert [note.rsplit(" ", 1)[1] for note in notes] == ["metrics.jsonl", "config.toml"]
+
+
 @pytest.mark.parametrize("command", ["table", "plot", "report"])
 @pytest.mark.parametrize(
     ("line", "says"),

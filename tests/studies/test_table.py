@@ -14,8 +14,9 @@ from by_hand import made, row, written
 from pmt_jax.config.methods import METHODS
 from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, statistics
-from pmt_jax.studies.rows import TableRow
-from pmt_jax.studies.run_log import Group, RunLog, groups, read
+from pmt_jax.studies.rows import TableRow, rows
+from pmt_jax.studies.run_log import Group, RunLog, groups, read, read_all
+from pmt_jax.training import final
 
 
 def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
@@ -74,6 +75,21 @@ def test_limits_are_those_of_the_costs_beside_them(tmp_path: pathlib.Path, cli):
     assert line.split()[-3:] == ["1", "1/1", "0.8"]
     made(tmp_path / "all", "lane", "happo", {0: [1, 0.5]}, true_episode_cost=0.5)
     assert "true cost (limit 1)" in cli("compare", tmp_path / "seen", tmp_path / "all")[1]
+
+
+def test_what_mean_actions_cost_is_what_they_are_judged_by(tmp_path: pathlib.Path, cli):
+    """True costs, where not all are noticed; a seed that broke has no cost and is not within."""
+    seen = {"cost_limit": 0.1, "episode_cost": 0.05, "true_episode_cost": 0.5}
+    lines = [row(100, seed, 1.0, **seen, **({"broken": "a weight"} if seed == 2 else {})) for seed in range(3)]
+    run = written(tmp_path / "seen", lines, 'task = "lane"\ncost_seen = 0.1\n')
+    ended = json.loads(row(100, 0, 2.0, cost_limit=0.1, episode_cost=0.05))
+    final.write(run, [ended | {"seed": seed, "true_episode_cost": cost} for seed, cost in enumerate((0.5, 3.0))])
+    (data,) = json.loads(cli("table", tmp_path, "--format", "json")[1])["rows"]
+    assert (data["mean_actions"]["within"], data["mean_actions"]["seeds"]) == (1, 3)
+    (log,) = read_all([run])
+    (found,) = rows([log])
+    np.testing.assert_allclose(found.deployed["cost"], [0.5, 3.0, np.nan])
+    np.testing.assert_allclose(found.deployed["beyond"], [-0.5, 2.0, np.nan])
 
 
 def test_a_mistake_in_one_of_many_runs_names_its_file(tmp_path: pathlib.Path, cli):
