@@ -341,7 +341,8 @@ def as_mean_actions(file: pathlib.Path) -> str:
         line = [*([run["task"]] if several else []), f"{run['cost_limit']:g}", label]
         row = row_of(run)
         of_mean, of_mean_reward = (row.scores[f"{OF_MEAN_ACTIONS}{name}"] for name in ("cost", "reward"))
-        beyond = row.scores.get(f"{OF_MEAN_ACTIONS}{BEYOND}", of_mean - run["cost_limit"])
+        judged = f"{OF_MEAN_ACTIONS}{BEYOND}"
+        beyond = row.scores[judged] if judged in row.scores else of_mean - run["cost_limit"]
         with_noise = row.beyond, row.score("worst agent"), row.scores["reward"]
         for excess, cost, reward in (with_noise, (beyond, of_mean, of_mean_reward)):
             line += [f"{(excess <= 0).sum()} of {excess.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
