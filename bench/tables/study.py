@@ -109,7 +109,8 @@ def as_controls(files: pathlib.Path) -> str:
     compared = [run for run in stored if run["task"] == stored[0]["task"] and share(run) < 1]
     found = {run.get("label", run["method"]): run for run in compared}
     end = min(run["steps"][-1] for run in found.values())
-    scores = {name: _until(run, end) for name, run in found.items()}
+    together = all(run["steps"][-1] == end for run in found.values())
+    scores = {name: measures(run) if together else _until(run, end) for name, run in found.items()}
     lines = {name: words for name, words in CONTROLS.items() if name in found}
     tested = [(name, other) for name in lines for other in PAIR if name not in (other, PAIR[0])]
     p = holm([welch_test(scores[name]["training"], scores[other]["training"]) for name, other in tested])
@@ -203,11 +204,11 @@ def _rank(run: runs.Run) -> int:
 def as_weights(file: pathlib.Path) -> str:
     """How far regret's weight on the ratio is from 1: a row for each run with regret, means over its seeds."""
     body = []
-    for run in sorted(runs.load(file), key=lambda run: (run["task"], -share(run), _rank(run))):
-        mean, std = (np.array(run["diagnostics"].get(f"regret/weight_{x}", ())) for x in ("mean", "std"))
-        if std.size:
-            line = [run["task"], f"{share(run):g}", NAMES[run["method"]]]
-            body.append([*line, f"{mean.min():.4f} to {mean.max():.4f}", f"{std.max():.4f}", f"{std[-1]:.4f}"])
+    weighed = [run for run in runs.load(file) if "regret/weight_mean" in run["diagnostics"]]
+    for run in sorted(weighed, key=lambda run: (run["task"], -share(run), _rank(run))):
+        mean, std = (np.array(run["diagnostics"][f"regret/weight_{x}"]) for x in ("mean", "std"))
+        line = [run["task"], f"{share(run):g}", NAMES[run["method"]]]
+        body.append([*line, f"{mean.min():.4f} to {mean.max():.4f}", f"{std.max():.4f}", f"{std[-1]:.4f}"])
     head = [
         "task",
         "p",
@@ -219,7 +220,8 @@ def as_weights(file: pathlib.Path) -> str:
 
 
 def mean_sd(x: Scores) -> str:
-    spec = ".0f" if abs(x.mean()) >= 100 else ".1f"
+    small = abs(x.mean()) < 10 and x.std(ddof=1) < 0.5
+    spec = ".0f" if abs(x.mean()) >= 100 else ".2f" if small else ".1f"
     return f"{x.mean():{spec}} +- {x.std(ddof=1):{spec}}"
 
 
