@@ -58,6 +58,8 @@ def load_config(
     table = source if isinstance(source, dict) else _read(source)
     source = "a [[sweep]]" if isinstance(source, dict) else source
     own = chosen(table)
+    if isinstance(table.get("method"), dict) and not isinstance(own, str | None):
+        raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
     if method is None:
         method = own if isinstance(own, str) else str(Config.method)
     method = methods.known(method)

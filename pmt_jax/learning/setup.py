@@ -24,7 +24,8 @@ class Trials:
     """What trains side by side in one program if it is more than the seeds of one run: a part of a sweep.
 
     Attributes:
-      hyper: every lane's own settings, leaves [L], or [] if all share them; seed: [L] int32.
+      hyper: every lane's own settings, leaves [L], or [] if all share them, limits of K costs [L, K] or [K].
+      seed: [L] int32.
       index: [L] int, which of its run's seeds a lane is.
     """
 

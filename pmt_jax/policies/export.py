@@ -50,8 +50,8 @@ def export_policy(
             given = [np.asarray(x, np.float32) for x in (named["obs_mean"] + named["obs_scale"] * obs, *hidden)]
             onnx_policy.write(named, partial / "policy.onnx")
             onnx_policy.check(partial / "policy.onnx", given, jax.tree.leaves(jax.device_get(program(*given))))
-    if not onnx:  # what an export before this one left is another policy
-        (out / "policy.onnx").unlink(missing_ok=True)
+        else:  # what an export before this one left is another policy
+            (out / "policy.onnx").unlink(missing_ok=True)
     return ["policy.stablehlo", "policy.npz", "numpy_policy.py", *(["policy.onnx"] if onnx else [])]
 
 

@@ -124,9 +124,7 @@ def _summary(log: RunLog) -> str:
     seeds = ", ".join(map(str, log.seeds))
     seconds = log.metrics.get("seconds", [[math.nan]])[0][-1]
     wrong = faults(log.faults, int(log.steps[-1]) * len(log.seeds))
-    broke = "".join(
-        f" Seed {seed} broke by step {step:,}; its policy is the one before." for seed, step in log.broken.items()
-    )
+    broke = "".join(f" Seed {seed} broke by step {step:,} and was not trained on." for seed, step in log.broken.items())
     took = f" in {seconds:,.0f} s" if math.isfinite(seconds) else ""
     return (
         f"{log.method} on {log.task}, seeds {seeds}; {int(log.steps[-1]):,} environment steps a seed{took}; "

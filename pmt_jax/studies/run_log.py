@@ -11,7 +11,7 @@ import json
 import math
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -207,8 +207,8 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
         if not folders and not begun:
             reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
         for folder in folders:
-            if any(log.folder == folder for log in logs):
-                continue
+            if any(os.path.realpath(log.folder) == os.path.realpath(folder) for log in logs):
+                continue  # behind a link, too
             log = read(folder, note)
             if log is None:
                 reasons.append(f"{folder} has no metrics yet: its metrics.jsonl has no row")
@@ -226,19 +226,26 @@ def _folders(path: pathlib.Path) -> tuple[list[pathlib.Path], list[str]]:
 
     Hidden folders are left out.
     """
-    found, reasons, met = [], [], set()
+    found, reasons = [], []
+    for folder, _, files in _walk(path):
+        missing = [name for name in ("config.toml", "metrics.jsonl") if name not in files]
+        if not missing:
+            found.append(folder)
+        elif len(missing) == 1 and folder != path:
+            reasons.append(f"{folder} is no run folder: it has no {missing[0]}")
+    return sorted(found), reasons
+
+
+def _walk(path: pathlib.Path) -> Iterator[tuple[pathlib.Path, list[str], list[str]]]:
+    """Each folder at and below `path` once, also behind links, with its folders and files; not below hidden ones."""
+    met = set()
     for folder, inner, files in os.walk(path, followlinks=True):
         if (real := os.path.realpath(folder)) in met:  # a link to a folder above it
             inner.clear()
             continue
         met.add(real)
+        yield pathlib.Path(folder), sorted(inner), files
         inner[:] = sorted(name for name in inner if not name.startswith("."))
-        missing = [name for name in ("config.toml", "metrics.jsonl") if name not in files]
-        if not missing:
-            found.append(pathlib.Path(folder))
-        elif len(missing) == 1 and folder != str(path):
-            reasons.append(f"{folder} is no run folder: it has no {missing[0]}")
-    return sorted(found), reasons
 
 
 def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
@@ -261,7 +268,8 @@ def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
 def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
     """The points of sweeps at and below `path` that have not ended, as far as they are; each names its later folder."""
     found = []
-    for group in sorted(path.rglob(".group-*")):
+    hidden = ((folder, name) for folder, inner, _ in _walk(path) for name in inner if name.startswith(".group-"))
+    for group in sorted(folder / name for folder, name in hidden):
         metrics = group / "run" / "metrics.jsonl"
         try:
             configs = {file.stem: _config(file) for file in program_folder.point_files(group)}

@@ -108,7 +108,8 @@ def check_tasks(configs: Iterable[Config]) -> None:
 
 def _needs(config: Config) -> str:
     """Equal for configurations whose tasks can be made, or cannot, alike."""
-    return repr((config.task, config.env, config.physics, config.method, config.cost_limit))
+    multiplier = bool(config.lambda_init), bool(config.lambda_max)
+    return repr((config.task, config.env, config.physics, config.method, config.cost_limit, multiplier))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,6 +47,9 @@ def test_a_method_that_a_file_names_takes_its_table_of_the_file_below(tmp_path: 
     (tmp_path / "over.toml").write_text('extends = "top.toml"\n[method.f4sg]\nclip = 0.1\n')
     config = load_config(tmp_path / "over.toml")
     assert (config.method, config.emotion_l2, config.clip) == ("f4sg", 7.0, 0.1)
+    (tmp_path / "several.toml").write_text('extends = "base.toml"\nmethod = ["f4sg", "happo"]\n')
+    with pytest.raises(UsageError, match="'method' must be a name"):
+        load_config(tmp_path / "several.toml")
 
 
 def test_precedence_is_defaults_file_method_table_overrides(tmp_path: pathlib.Path):
