@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import pathlib
@@ -77,10 +76,8 @@ def writing_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
     try:
         partial.mkdir(parents=True)
         yield partial
-        if not out.exists():
-            partial.rename(out)
-        elif not out.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        if not out.is_dir():
+            partial.rename(out)  # which a file refuses
         else:
             for file in partial.iterdir():
                 file.replace(out / file.name)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import pathlib
-import sys
 
 from pmt_jax import load_config
+from pmt_jax.cli import end
 from pmt_jax.errors import UsageError
 
 from .contest import PEERS, SIZES
@@ -37,4 +37,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
+    end(0)

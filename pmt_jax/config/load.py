@@ -57,9 +57,7 @@ def load_config(
     """
     table = source if isinstance(source, dict) else _read(source)
     source = "a [[sweep]]" if isinstance(source, dict) else source
-    own = chosen(table)
-    if isinstance(table.get("method"), dict) and not isinstance(own, str | None):
-        raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
+    own, _ = named(table)
     if method is None:
         method = own if isinstance(own, str) else str(Config.method)
     method = methods.known(method)
@@ -85,11 +83,8 @@ def _read(source: str | pathlib.Path) -> dict[str, Any]:
 def _for_method(source: str | pathlib.Path, table: dict[str, Any], method: str) -> dict[str, Any]:
     """What a file says of one method: what all share, then the method's own table."""
     shared = {name: value for name, value in table.items() if name != "method"}
-    tables = table.get("method", {})
-    if isinstance(tables, str):  # a run's own config.toml names its one method
-        return shared
-    tables = {name: own for name, own in tables.items() if name != CHOSEN} if isinstance(tables, dict) else tables
-    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+    own, tables = named(table)
+    if not isinstance(own, str | None) or not all(isinstance(t, dict) for t in tables.values()):
         raise UsageError(f"{source}: 'method' must be a name, or [method.NAME] tables")
     for name, own in tables.items():  # those of other methods, too, or a typing error shows in one run of many
         methods.known(name)
@@ -213,16 +208,18 @@ def _identity(source: str) -> str:
 
 def over(base: Table, top: Table) -> Table:
     """`top` laid over `base`, tables within them key by key; a method named by one stays beside tables of the other."""
-    named = [layer for layer in (base, top) if not isinstance(layer.get("method", {}), dict)]
-    if len(named) == 1 and "method" in base and "method" in top:
-        base, top = (x | {"method": {CHOSEN: x["method"]}} if x in named else x for x in (base, top))
+    named_by = [x for x in (base, top) if not isinstance(x.get("method", {}), dict)]
+    if len(named_by) == 1 and "method" in base and "method" in top:
+        base, top = (x | {"method": {CHOSEN: x["method"]}} if x in named_by else x for x in (base, top))
     return _merged(base, top)
 
 
-def chosen(table: Table) -> Any:
-    """The method that settings name; None if they do not."""
+def named(table: Table) -> tuple[Any, Table]:
+    """The method that settings name, None if they do not, and their [method.NAME] tables."""
     method = table.get("method")
-    return method.get(CHOSEN) if isinstance(method, dict) else method
+    if not isinstance(method, dict):
+        return method, {}
+    return method.get(CHOSEN), {name: own for name, own in method.items() if name != CHOSEN}
 
 
 def _merged(base: Table, top: Table) -> Table:

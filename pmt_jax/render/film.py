@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import html
+import itertools
 import pathlib
 import subprocess
 from collections.abc import Callable, Iterator
@@ -119,7 +120,7 @@ def _captioned(episode: Episode, frames: Iterator[np.ndarray]) -> Iterator[np.nd
 def durations(count: int, fps: float) -> list[int]:
     """[count] ms that a GIF shows each frame; it counts in 10 ms, so that some are longer for the mean to be right."""
     ends = [round(100 * frame / fps) for frame in range(count + 1)]
-    return [10 * (end - begin) for begin, end in zip(ends, ends[1:], strict=False)]
+    return [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
 
 
 def _write_film(frames: Iterator[np.ndarray], count: int, out: pathlib.Path, fps: float, size: tuple[int, int]) -> None:

@@ -252,9 +252,8 @@ def _part(file: str | pathlib.Path, shared: dict[str, Any], table: dict[str, Any
         number = table.get(name, least)
         if isinstance(number, bool) or not isinstance(number, int) or number < least:
             raise UsageError(f"{file}: {name} must be a whole number of at least {least}, not {number!r}")
-    if (method := load.chosen(merged)) is not None:  # one or several; tables [method.NAME] stay
-        tables = merged["method"] if isinstance(merged["method"], dict) else {}
-        merged["method"] = {name: own for name, own in tables.items() if name != load.CHOSEN}
+    method, merged["method"] = load.named(merged)
+    if method is not None:  # one or several
         varied = {"method": method, **varied}
     ranges = {k: found for k, v in varied.items() if (found := _range(v))}
     values = {k: v if isinstance(v, list) else [v] for k, v in varied.items() if k not in ranges}

@@ -145,9 +145,14 @@ def rows(logs: Sequence[RunLog], note: Note | None = None) -> list[TableRow]:
 
 
 def in_order(rows: Sequence[RowOrGroup]) -> list[RowOrGroup]:
-    """Sorted by task, then as METHODS is; methods that are not in it last."""
+    """Sorted by task, then by `place`."""
+    return sorted(rows, key=lambda row: (row.task, place(row.method)))
+
+
+def place(method: str) -> int:
+    """Sorts methods as METHODS is; those that are not in it come last."""
     order = list(METHODS)
-    return sorted(rows, key=lambda row: (row.task, order.index(row.method) if row.method in order else len(order)))
+    return order.index(method) if method in order else len(order)
 
 
 def _row(group: Group) -> TableRow:
@@ -185,9 +190,8 @@ def _deployed(group: Group) -> dict[str, np.ndarray]:
         return np.concatenate([other if x is None else x for x, other in zip(found, unknown, strict=True)])
 
     def cost(end: RunLog) -> np.ndarray | None:
-        name = "true_episode_cost" if end.judges_true_costs else "episode_cost"
-        worst = end.final(f"{name}{WORST}")
-        return end.final(name) if worst is None else worst
+        worst = end.final(f"{end.judged_cost}{WORST}")
+        return end.final(end.judged_cost) if worst is None else worst
 
     return {
         "reward": joined(lambda end: end.final("episode_reward")),

@@ -112,19 +112,13 @@ class RunLog:
     @property
     def excess(self) -> np.ndarray:
         """[S] how far a seed's costs at the end (see `final`) are beyond their limits, the agent and cost furthest."""
-        name = "true_episode_cost" if self.judges_true_costs else "episode_cost"
-        return self.judged_limits.excess(self._costs(name))
+        return self.limits_on(self.judged_cost).excess(self._costs(self.judged_cost))
 
     @property
-    def judged_limits(self) -> Limits:
-        """The limits that `excess` is beyond: on true costs, where not all of one cost is observed (`cost_seen`)."""
-        return self.true_limits if self.judges_true_costs else self.limits
-
-    @property
-    def judges_true_costs(self) -> bool:
-        """Whether not all of one cost is observed, and the true ones are known."""
-        several = len(self.limits.each) > 1
-        return self.settings.get("cost_seen", 1.0) < 1 and not several and "true_episode_cost" in self.metrics
+    def judged_cost(self) -> str:
+        """The metric that limits are on: true costs, where not all of one cost is observed (`cost_seen`)."""
+        hidden = self.settings.get("cost_seen", 1.0) < 1 and len(self.limits.each) == 1
+        return "true_episode_cost" if hidden and "true_episode_cost" in self.metrics else "episode_cost"
 
     @property
     def true_limits(self) -> Limits:
@@ -194,7 +188,8 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
       UsageError: a path does not exist, none of them holds a run with metrics, or a run cannot be read.
     """
     note = note or to_stderr
-    logs, reasons = [], []
+    logs: dict[str, RunLog] = {}  # by the folders that links lead to
+    reasons = []
     for path in dict.fromkeys(paths):
         if str(path).startswith("hub:"):
             raise UsageError(f"{path} is a pretrained policy, which has no metrics of its training; name a run folder")
@@ -203,22 +198,23 @@ def read_all(paths: Sequence[pathlib.Path], note: Note | None = None) -> list[Ru
         begun = _under_way(path, note)  # first: what ends meanwhile is then found in both places
         folders, unfinished = _folders(path)
         reasons += unfinished
-        logs += [log for log in begun if all(log.folder != other.folder for other in logs)]
+        for log in begun:
+            logs.setdefault(os.path.realpath(log.folder), log)
         if not folders and not begun:
             reasons.append(f"{path} holds no run: no folder in it has a config.toml and a metrics.jsonl")
         for folder in folders:
-            if any(os.path.realpath(log.folder) == os.path.realpath(folder) for log in logs):
-                continue  # behind a link, too
+            if (real := os.path.realpath(folder)) in logs:
+                continue
             log = read(folder, note)
             if log is None:
                 reasons.append(f"{folder} has no metrics yet: its metrics.jsonl has no row")
             else:
-                logs.append(log)
+                logs[real] = log
     if not logs:
         raise UsageError("; ".join(reasons) or "no run folder was named")
     for reason in reasons:
         note(f"left out: {reason}")
-    return logs
+    return [*logs.values()]
 
 
 def _folders(path: pathlib.Path) -> tuple[list[pathlib.Path], list[str]]:

@@ -48,8 +48,8 @@ def _kept(log: RunLog, by_training: np.ndarray, by_mean: np.ndarray | None) -> s
     parts = [f"unknown {where}, as no episode ended" if unknown else f"kept {_count(by_training, where)}"]
     if by_mean is not None:
         parts.append(("kept " if unknown else "") + _count(by_mean, "under mean actions"))
-    true = " on true costs" if log.judged_limits != log.limits else ""
-    return f"limit {log.judged_limits}{true}: {'; '.join(parts)}"
+    true = " on true costs" if log.judged_cost.startswith("true_") else ""
+    return f"limit {log.limits_on(log.judged_cost)}{true}: {'; '.join(parts)}"
 
 
 def _count(excess: np.ndarray, where: str) -> str:
