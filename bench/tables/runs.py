@@ -17,7 +17,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.formats import markdown, number
 from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
-from pmt_jax.studies.rows import TableRow, in_order, rows
+from pmt_jax.studies.rows import TableRow, in_order, place, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
 from pmt_jax.studies.statistics import iqm, mean_interval
 from pmt_jax.tasks import columns
@@ -180,7 +180,7 @@ def as_overview(files: pathlib.Path) -> str:
         for (task, _), (row, text) in _summaries(files).items()
         if row.settings or not has_multiplier(row.method)
     }
-    methods = sorted({name for _, name in cells}, key=_rank)
+    methods = sorted(dict.fromkeys(name for _, name in cells), key=place)
     body = [
         [f"`{task}`", *(cells.get((task, method), "-") for method in methods)]
         for task in dict.fromkeys(task for task, _ in cells)
@@ -201,12 +201,6 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
     if doubled := [f"{label} on {task}" for (task, label), count in often.items() if count > 1]:
         raise UsageError(f"{files}: several runs of {doubled[0]}, of which a table of methods by tasks can show one")
     return {(row.task, row.label): (row, text) for row, text in zip(found, words, strict=True)}
-
-
-def _rank(method: str) -> tuple[int, str]:
-    """Sorts as METHODS is; methods that are not in it last."""
-    order = list(METHODS)
-    return (order.index(method) if method in order else len(order)), method
 
 
 def as_printed(file: pathlib.Path) -> str:
@@ -317,7 +311,7 @@ def as_points(file: pathlib.Path) -> str:
     found = load(file)
     hidden = any(run["table"].get(TRUE, run["table"]["cost"]) != run["table"]["cost"] for run in found)
     columns = ("cost", *([TRUE] if hidden else ()), WHILE_TRAINING, "reward")
-    found.sort(key=lambda run: (run["task"], _rank(run["method"])))
+    found.sort(key=lambda run: (run["task"], place(run["method"])))
     present = [column for column in columns if all(column in run["table"] for run in found)]
 
     def cell(values: np.ndarray) -> str:
@@ -333,7 +327,7 @@ def as_mean_actions(file: pathlib.Path) -> str:
 
     Costs are the worst agent's where agents differ.
     """
-    found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], _rank(run["method"])))
+    found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], place(run["method"])))
     several = len({run["task"] for run in found}) > 1
     body = []
     for run in found:

@@ -110,11 +110,6 @@ def _times_mappo_l(row: Record, rows: Records) -> float | None:
     return ratio and 1 / ratio
 
 
-def _compile_times_mappo_l(row: Record, rows: Records) -> float | None:
-    reference = matching(rows, task=row["task"], method="mappo_l")
-    return row["compile_seconds"] / reference[0]["compile_seconds"] if reference and "compile_seconds" in row else None
-
-
 def _of_mappo_l(row: Record, rows: Records) -> float | None:
     return _over(row, rows, name="pmt train, MAPPO-L")
 
@@ -210,7 +205,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "trace, CPU-s": _shown("{:g}", "trace_cpu_seconds"),
     "compile, CPU-s": _shown("{:g}", "compile_cpu_seconds"),
     "compile, s": _shown("{:.1f}", "compile_seconds"),
-    "compile x MAPPO-L": _shown("{:.2f}", _compile_times_mappo_l),
     "update, s": _shown("{:.3f}", _update_seconds),
     "update x MAPPO-L": _shown("{:.2f}", _times_mappo_l),
     "x one seed": _shown("{:.2f}", _times_one_seed),
@@ -431,7 +425,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "methods": Table(
         "methods",
         ("training",),
-        ("task", "method", "compile, s", "compile x MAPPO-L", "update, s", "update x MAPPO-L", "environment steps/s"),
+        ("task", "method", "compile, s", "update x MAPPO-L", "environment steps/s"),
     ),
     "power_flows": Table(
         "grid", ("power flow",), ("task", "batch", "what", "power flows/s", "ours f32 is faster by (lowest)")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmt_jax.formats import markdown
+from pmt_jax.studies.rows import place
 from pmt_jax.studies.statistics import difference_interval, holm, welch_test
 
 from . import runs
@@ -109,7 +110,7 @@ def as_controls(files: pathlib.Path) -> str:
     compared = [run for run in stored if run["task"] == stored[0]["task"] and share(run) < 1]
     found = {run.get("label", run["method"]): run for run in compared}
     end = min(run["steps"][-1] for run in found.values())
-    together = all(run["steps"][-1] == end for run in found.values())
+    together = all(run["steps"][-1] == end for run in found.values())  # then the figures of all rows count
     scores = {name: measures(run) if together else _until(run, end) for name, run in found.items()}
     lines = {name: words for name, words in CONTROLS.items() if name in found}
     tested = [(name, other) for name in lines for other in PAIR if name not in (other, PAIR[0])]
@@ -197,15 +198,11 @@ def _limit(run: runs.Run) -> float:
     return round(run["cost_limit"] / share(run), 9)
 
 
-def _rank(run: runs.Run) -> int:
-    return list(NAMES).index(run["method"])
-
-
 def as_weights(file: pathlib.Path) -> str:
     """How far regret's weight on the ratio is from 1: a row for each run with regret, means over its seeds."""
     body = []
     weighed = [run for run in runs.load(file) if "regret/weight_mean" in run["diagnostics"]]
-    for run in sorted(weighed, key=lambda run: (run["task"], -share(run), _rank(run))):
+    for run in sorted(weighed, key=lambda run: (run["task"], -share(run), place(run["method"]))):
         mean, std = (np.array(run["diagnostics"][f"regret/weight_{x}"]) for x in ("mean", "std"))
         line = [run["task"], f"{share(run):g}", NAMES[run["method"]]]
         body.append([*line, f"{mean.min():.4f} to {mean.max():.4f}", f"{std.max():.4f}", f"{std[-1]:.4f}"])
