@@ -112,6 +112,7 @@ def _add_reproduce(commands: Any) -> None:
         metavar="WORD",
         help="smoke (default): minutes, to see that everything runs | paper: all steps and seeds; days on a CPU",
     )
+    reproduce.add_argument("--seeds", type=whole(1), metavar="N", help="seeds a run (default: the budget's)")
     reproduce.add_argument(
         "--out", type=path, metavar="DIR", help="the folder of its runs (default: runs/reproduce-BUDGET)"
     )
@@ -200,6 +201,7 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
     from ..studies import reproduce
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
-    code = reproduce.reproduce(arguments.table, arguments.budget, out, arguments.format, _launch(arguments))
+    wanted = (arguments.table, arguments.budget, arguments.seeds)
+    code = reproduce.reproduce(*wanted, out, arguments.format, _launch(arguments))
     check_written()
     return code

@@ -17,11 +17,19 @@ from .run_log import read_all
 from .sweep import ONE_AT_A_TIME, Launch, check_tasks, missing_programs, train_programs
 
 
-def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", launch: Launch = ONE_AT_A_TIME) -> int:
+def reproduce(
+    name: str,
+    budget: str,
+    seeds: int | None,
+    out: pathlib.Path,
+    layout: str = "text",
+    launch: Launch = ONE_AT_A_TIME,
+) -> int:
     """Trains what is missing of a table of the paper, its methods on its tasks, and prints it next to the paper's.
 
     Args:
       name: a table in paper.toml; budget: one of its budgets; layout: of the table, see `table.FORMATS`.
+      seeds: of each method on each task; None for the budget's.
 
     Raises:
       UsageError: an unknown table or budget, or a task that cannot run here.
@@ -41,7 +49,7 @@ def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", l
     if absent:
         raise UsageError(f"{name} needs the task '{absent[0]}', which this version of pmt-jax does not have")
     methods = wanted.get("methods", paper.get("methods", list(METHODS)))
-    plans = {task: plan(task, methods, settings) for task in wanted["tasks"]}
+    plans = {task: plan(task, methods, settings, seeds) for task in wanted["tasks"]}
     check_tasks(next(iter(points.values())) for points in plans.values())
     with contextlib.ExitStack() as stack:
         for task in plans:
@@ -56,7 +64,8 @@ def reproduce(name: str, budget: str, out: pathlib.Path, layout: str = "text", l
     return 0
 
 
-def plan(task: str, methods: Sequence[str], budget: Mapping[str, str]) -> Points:
-    """A budget's settings of a task: its `source` for that task, or its `preset` over the task's own."""
+def plan(task: str, methods: Sequence[str], budget: Mapping[str, str], seeds: int | None = None) -> Points:
+    """A budget's settings of a task: its `source` for that task, or its `preset` over the task's own, and `seeds`."""
     source = budget.get("source", "{task}").format(task=task)
-    return make_points([Part(source, {"method": methods})], preset=budget.get("preset", "default"))
+    fixed = {} if seeds is None else {"seeds": seeds}
+    return make_points([Part(source, {"method": methods})], preset=budget.get("preset", "default"), **fixed)

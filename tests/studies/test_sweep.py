@@ -242,10 +242,10 @@ def test_reproduce_runs_what_is_missing_and_prints_it(alone: pathlib.Path, tmp_p
     tiny |= {"log_interval": 2, "critic_lr": 0.001}  # the run alone, whose program is in the compile cache
     plan = {"title": "Table 0", "tasks": ["lane"], "methods": ["happo"], "baseline": "happo"}
     sizes = tmp_path / "sizes.toml"
-    sizes.write_text(tomli_w.dumps({"extends": "lane", "steps": 600, **tiny}))
+    sizes.write_text(tomli_w.dumps({"extends": "lane", "steps": 600, **tiny, "seeds": 3}))
     paper = {"tables": {"table0": plan}, "budgets": {"smoke": {"source": str(sizes)}}, "tasks": {}}
     monkeypatch.setattr(table, "paper", lambda: paper)
-    command = ("reproduce", "table0", "--out", tmp_path, "--no-cache")
+    command = ("reproduce", "table0", "--seeds", "2", "--out", tmp_path, "--no-cache")
     code, out, _ = cli(*command)
     assert code == 0 and "Table 0, budget 'smoke'" in out
     assert load_config(tmp_path / "lane" / "method=happo" / "config.toml").steps == 600
