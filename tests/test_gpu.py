@@ -12,6 +12,7 @@ import subprocess
 import sys
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from envs.physics.fused.model import tables
 from envs.velocity import robots
 from paths import DATA, ROOT
 from pmt_jax import METHODS, load_config, make_setup
-from pmt_jax.learning import fused, learner
+from pmt_jax.learning import fused, learner, trust_region
 from pmt_jax.learning.evaluation import play
 from pmt_jax.learning.networks import MLP
 from pmt_jax.training.run_folder import MATMUL_PRECISION
@@ -410,6 +411,25 @@ def test_a_networks_kernels_compute_what_xla_computes(shape, float32_products):
     stacked = jax.tree.map(lambda x: jnp.stack([1.1 * x, x]), params)
     beside = jax.jit(jax.vmap(functools.partial(fused.apply, module), (0, None)))(stacked, jnp.asarray(x))[1]
     assert same(beside, jax.jit(functools.partial(fused.apply, module))(params, jnp.asarray(x)))
+
+
+def test_the_fisher_products_of_tensor_cores_are_those_of_float32(monkeypatch, float32_products):
+    module, params = network_of((128, 128), 4, "relu", True, False, 29)
+    start, unravel = jax.flatten_util.ravel_pytree(params)
+    obs, step = jax.random.normal(jax.random.key(1), (4096, 29)), jax.random.normal(jax.random.key(2), start.shape)
+
+    def policy(flat):
+        mean = module.apply(unravel(flat), obs)
+        return mean, jnp.ones_like(mean)
+
+    def divergence(mean, std):
+        return jnp.mean((mean - jax.lax.stop_gradient(policy(start)[0])) ** 2 / std)
+
+    assert fused.available()
+    found = jax.jit(lambda v: trust_region.fisher(policy, divergence, start)(v))(step)
+    monkeypatch.setattr(trust_region.gpu, "available", lambda: False)
+    expected = jax.jit(lambda v: trust_region.fisher(policy, divergence, start)(v))(step)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5 * float(np.abs(expected).max()))
 
 
 @pytest.mark.parametrize("method", ["mappo_l", "macpo", "mixed", "mappo", "ippo_l"])

@@ -5,6 +5,7 @@ From top to bottom: the step, its direction by the exact dual, the line search.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from . import sharding
+from .fused import gpu
 from .maths import distributions
 from .maths.pytree import pytree
 from .schedules import Schedule
@@ -25,6 +27,7 @@ LINE_SEARCH_STEPS = 10
 STEP_DECAY = 0.8  # factor between one step of the line search and the next
 DAMPING = 0.1  # added to the Fisher matrix
 PARTS = 16  # of the rows, see `in_parts`
+PRECISION = "TF32_TF32_F32_X3"  # of Fisher products on tensor cores: three of TF32 that make up one of float32
 KL_SLACK = 1.5  # a step is accepted up to this multiple of the trust region
 
 Hvp = Callable[[jax.Array], jax.Array]
@@ -128,10 +131,21 @@ def fisher(
     There its gradient is 0, so the Hessian is J' M J: J of the policy's outputs, M of the divergence in them. That
     takes two thirds of the products that differentiating twice does.
     """
-    outputs, push = jax.linearize(policy, start)
-    pull = jax.linear_transpose(push, start)
+    with _precision():
+        outputs, push = jax.linearize(policy, start)
+        pull = jax.linear_transpose(push, start)
     _, curvature = jax.linearize(jax.grad(divergence, (0, 1)), *outputs)
-    return lambda v: pull(curvature(*push(v)))[0] + DAMPING * v
+
+    def hvp(v: jax.Array) -> jax.Array:
+        with _precision():
+            return pull(curvature(*push(v)))[0] + DAMPING * v
+
+    return hvp
+
+
+def _precision() -> contextlib.AbstractContextManager[object]:
+    """Inside, matrix products have `PRECISION` where a GPU can."""
+    return jax.default_matmul_precision(PRECISION) if gpu.available() else contextlib.nullcontext()
 
 
 def _most_violated(samples: PolicySamples, violation: jax.Array) -> tuple[PolicySamples, jax.Array]:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from pmt_jax.learning import constraint
+from pmt_jax.learning.fused import gpu
 from pmt_jax.learning.maths import distributions, running_moments
 from pmt_jax.learning.maths.advantages import gae, standardise
 from pmt_jax.learning.maths.losses import (
@@ -27,6 +28,7 @@ from pmt_jax.learning.networks import LayerNorm
 from pmt_jax.learning.optimise import fit, init_train_state, shuffled
 from pmt_jax.learning.trust_region import (
     DAMPING,
+    PRECISION,
     backtrack,
     conjugate_gradient,
     constrained_direction,
@@ -397,6 +399,23 @@ def test_the_fisher_matrix_is_the_hessian_of_the_divergence():
     hessian = jax.hessian(lambda flat: divergence(*policy(flat)))(start) + DAMPING * jnp.eye(10)
     columns = jax.vmap(fisher(policy, divergence, start), out_axes=1)(jnp.eye(10))
     np.testing.assert_allclose(columns, hessian, atol=1e-5)
+
+
+def test_products_of_the_fisher_matrix_use_tensor_cores_where_there_are_some(monkeypatch):
+    obs, start = jax.random.normal(jax.random.key(0), (20, 3)), jnp.arange(6.0) / 6
+
+    def policy(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean = jnp.tanh(obs @ flat.reshape(3, 2))
+        return mean, jnp.ones_like(mean)
+
+    def divergence(mean: jax.Array, std: jax.Array) -> jax.Array:
+        return jnp.mean(mean**2 / std)
+
+    for there_are in (True, False):
+        monkeypatch.setattr(gpu, "available", lambda there_are=there_are: there_are)
+        program = str(jax.make_jaxpr(lambda at, v: fisher(policy, divergence, at)(v))(start, start))
+        products = program.count("dot_general[")
+        assert products >= 3 and program.count(PRECISION) == there_are * products
 
 
 def test_a_policy_in_parts_has_the_same_outputs_and_products():
