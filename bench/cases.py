@@ -241,8 +241,6 @@ BENCHES = {
         (
             *(_training("ant_2x4", method, 1, 64, 64, *_BATCH) for method in METHODS),
             _training("ant_2x4", "mappo_l", 1, 64, 64, *_BATCH, _GRU, what="gru"),
-            *(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in METHODS),
-            _training("switch", "mappo_l", 1, 64, 64, *_LIKE_THE_ANT, _GRU, what="gru"),
         ),
         tuple(_training("switch", method, 1, 64, 64, *_LIKE_THE_ANT) for method in ("mappo_l", "r4sg")),
     ),

@@ -206,7 +206,7 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
 def as_printed(file: pathlib.Path) -> str:
     """Methods by tasks, of what a command of ours printed: reward with its interval / cost, and seeds within.
 
-    Above it the runs of the command, and how long they took together.
+    Above it the runs of the command, and how long they took together; also those of other commands that were only timed.
     """
     report = json.loads(file.read_text())
     printed = report["rows"]
@@ -217,14 +217,16 @@ def as_printed(file: pathlib.Path) -> str:
         reward, low, high = row["reward"]
         seeds = f"{row['within']} of {row['seeds']}"
         words[row["task"], row["method"]] = f"{reward:,.0f} [{low:,.0f}, {high:,.0f}] / {row['cost'][0]:.3g}, {seeds}"
-    count, steps = sum(row["seeds"] for row in printed), round(printed[0]["steps"] / 1e6)
-    devices = f"{report['devices']} x {report['device']}"
-    took = (
-        f"{count} runs of {steps} M steps in {report['seconds'] / 60:.1f} minutes on {devices}, all compiling included"
+    steps = round(printed[0]["steps"] / 1e6)
+    made = [report | {"runs": sum(row["seeds"] for row in printed)}, *report.get("timed", [])]
+    took = "; ".join(
+        f"`{one['command']}`, {one['runs']} runs of {steps} M steps in {one['seconds'] / 60:.1f} minutes on "
+        f"{one['devices']} x {one['device']}"
+        for one in made
     )
     head = ["", *(f"`{task}` (limit {limits[task]:g})" for task in tasks)]
     body = [[f"`{method}`", *(words.get((task, method), "-") for task in tasks)] for method in methods]
-    return f"`{report['command']}`, {took}:\n\n{markdown(head, body)}"
+    return f"{took}, all compiling included:\n\n{markdown(head, body)}"
 
 
 @functools.cache  # each run is compared with each

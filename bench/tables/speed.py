@@ -80,15 +80,6 @@ def _of_as_many_loops(row: Record, rows: Records) -> float | None:
     return _over(row, rows, kind="plain loop", task=row["task"], threads=threads)
 
 
-_ONE_SEED = ("kind", "task", "method", "physics", "num_envs", "rollout_length")  # what a program of one seed shares
-
-
-def _times_one_seed(row: Record, rows: Records) -> float | None:
-    same = {name: row.get(name) for name in _ONE_SEED}
-    ratio = _over(row, rows, **same, seeds=1) if row.get("seeds", 1) > 1 else None
-    return ratio and row["seeds"] / ratio
-
-
 def _of_reference_walls(row: Record, rows: Records) -> float | None:
     same = {name: row.get(name) for name in ("physics", "num_envs")}
     return _over(row, rows, **same, what="reference")
@@ -207,7 +198,6 @@ COLUMNS: dict[str, Callable[[Record, Records], str]] = {
     "compile, s": _shown("{:.1f}", "compile_seconds"),
     "update, s": _shown("{:.3f}", _update_seconds),
     "update x MAPPO-L": _shown("{:.2f}", _times_mappo_l),
-    "x one seed": _shown("{:.2f}", _times_one_seed),
     "efficiency": _shown("{:.2f}", _efficiency),
     "memory, GB": _shown("{:.1f}", "memory_gb"),
     "compile cache": _shown("{}", "cache"),
@@ -376,28 +366,6 @@ def limits(reports: Reports) -> str:
     return markdown(head, body)
 
 
-def side_by_side(reports: Reports) -> str:
-    """Seeds in one program on one GPU, next to one seed of the same size."""
-    body = []
-    for name, report in of_bench(reports, "loop").items():
-        for row in [row for row in report["rows"] if row["seeds"] > 1]:
-            if (times := _times_one_seed(row, report["rows"])) is not None:
-                one = matching(report["rows"], **{x: row[x] for x in _ONE_SEED}, seeds=1)[0]
-                size = _sizes("num_envs", "rollout_length")(one, [])
-                shown = [_rate_or_failure(x, []) for x in (one, row)]
-                body.append([size, _engine(row, []), str(row["seeds"]), *shown, f"{times:.2f}", f"`{name}`"])
-    head = (
-        "environments x steps",
-        "engine",
-        "seeds",
-        "one seed, steps/s",
-        "all seeds, steps/s",
-        "x one seed",
-        "result",
-    )
-    return markdown(head, body)
-
-
 SPEED = ("", "engine", "seeds x environments", "environment steps/s", "of plain loops at once")
 STARTS = ("what", "environments x steps", "compile cache", "compile, s", "first update, s", "memory, GB")
 EVERY = ("plain loop", "environment", "training")
@@ -452,14 +420,13 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "multi_goal": Table(
         "multi_goal", ("environment",), ("task", "engine", "seeds x environments", "environment steps/s")
     ),
-    "loop": Table("loop", ("training",), ("method", "engine", SIZES, "environment steps/s", "update, s", "x one seed")),
+    "loop": Table("loop", ("training",), ("method", "engine", SIZES, "environment steps/s", "update, s")),
     "scaling": Table(
         "scaling", ("training",), ("task", "scaling", "devices", SIZES, "environment steps/s", "efficiency")
     ),
     "hub": hub,
     "alternatives": alternatives,
     "limits": limits,
-    "side_by_side": side_by_side,
     "peers": Table(
         "peers",
         ("peer",),

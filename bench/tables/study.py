@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,12 @@ CONTROLS = {  # labels of stored runs, in the order of the table
     "current": "F4SG with fear of the current state",
     "squared": "F4SG with squared errors",
     "target_only": "fear as target of the cost critic alone",
+    "no_l2": "F4SG without the cognitive error",
+    "f4sg_letter": "F4SG as printed",
     "mixed": "Mixed",
     "r4sg": "R4SG",
+    "trace_99": "MAPPO-L with cost traces of 0.99",
+    "monte_carlo": "MAPPO-L with Monte Carlo costs",
     "mappo_pid": "MAPPO-L with a PID multiplier",
     "macpo": "MACPO",
 }
@@ -37,6 +41,19 @@ def measures(run: runs.Run) -> dict[str, Scores]:
     """The three measures of each seed: true cost at the end and per 1,000 steps of training, reward at the end."""
     columns = {"training": runs.TRUE_WHILE_TRAINING, "end": runs.TRUE, "reward": "reward"}
     return {name: np.array(run["table"][column], float) for name, column in columns.items()}
+
+
+def joined(found: Iterable[runs.Run]) -> list[runs.Run]:
+    """Runs that differ only in their seeds as one, in the order of the first of each."""
+    alike: dict[str, runs.Run] = {}
+    for run in found:
+        key = repr((run["task"], run.get("label"), run["steps"], runs.shared(run)))
+        one = alike.setdefault(key, run)
+        if not set(one["seeds"]) & set(run["seeds"]):
+            table = {column: [*x, *run["table"][column]] for column, x in one["table"].items()}
+            per_seed = {name: [*one[name], *run[name]] for name in ("seeds", *runs.CURVES, *runs.TRUE_CURVES)}
+            alike[key] = one | per_seed | {"table": table}
+    return list(alike.values())
 
 
 def share(run: runs.Run) -> float:
@@ -56,7 +73,7 @@ def pairs(files: pathlib.Path, pair: tuple[str, str] = PAIR) -> list[tuple[runs.
     They come by probability, then in the order of the files, whose names a + joins.
     """
     cells: dict[str, dict[str, runs.Run]] = {}
-    for run in runs.load(files):
+    for run in joined(runs.load(files)):
         if run["method"] in pair:
             cells.setdefault(_cell(run), {})[run["method"]] = run
     found = [(cell[pair[0]], cell[pair[1]]) for cell in cells.values() if len(cell) == len(pair)]
@@ -106,7 +123,7 @@ def as_controls(files: pathlib.Path) -> str:
     Of the runs in files joined by +, those on the task of the first one that do not notice every costly step. Holm
     corrects all tests of the table together.
     """
-    stored = runs.load(files)
+    stored = joined(runs.load(files))
     compared = [run for run in stored if run["task"] == stored[0]["task"] and share(run) < 1]
     found = {run.get("label", run["method"]): run for run in compared}
     end = min(run["steps"][-1] for run in found.values())

@@ -252,9 +252,7 @@ def test_ratios_between_rows_are_taken_turn_by_turn():
     alone = row("environment", [160, 90, 170], num_envs=8, physics="mujoco")  # the machine was busy in the second turn
     shown = speed.COLUMNS["of plain loops at once"](alone, [elsewhere, *loops, alone])
     assert shown == "0.85"  # the median of 0.8, 0.9 and 0.85
-    one, five = ({"kind": "training", "task": "x", "seeds": n, "steps_per_second": 100.0 * n / 2} for n in (1, 5))
-    assert speed.COLUMNS["x one seed"](five, [one, five]) == "1.00"
-    assert speed.COLUMNS["x one seed"](one, [one, five]) == "-"
+    five = {"kind": "training", "task": "x", "seeds": 5, "steps_per_second": 250.0}
     locked = loops[1] | {"steps_per_cpu_second": 125}  # that waited for each other
     assert speed.COLUMNS["of a plain loop on each core"](five, [locked, five]) == "1.00"
     assert speed.COLUMNS["of a plain loop on each core"](five, [five]) == "-"
@@ -355,7 +353,7 @@ def test_rendering_fills_numbers_in_sentences():
     assert values.number(mark.format("*")) == "20"
     assert values.number(mark.format("1").replace("within", "seeds")) == "10"
     both = "within:table1_ant_2x4_h200+recipe_ant_2x4_h200:f4sg+mappo_l:*"
-    assert values.number(both) == "70" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
+    assert values.number(both) == "80" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
     assert values.number("seeds:velocity_h200:macpo:25:velocity_hopper_3x1") == "5"  # of one task in a file of eight
     for wrong, said in (
         (mark.format("7"), "no run of laptop_ant_2x4 is 'f4sg:7'"),
@@ -731,6 +729,19 @@ def test_a_probe_compares_fear_where_all_else_is_equal(tmp_path: pathlib.Path):
     assert rows[0][5].startswith("-70.0 [") and rows[1][5].startswith("0.0 [")
 
 
+def test_runs_that_differ_in_their_seeds_are_one(tmp_path: pathlib.Path):
+    first, ours = run_of_three_seeds("mappo_l", 0.5, [10.0, 12.0]), run_of_three_seeds("r4sg", 0.5, [10.0, 12.0])
+    more = run_of_three_seeds("mappo_l", 0.5, [14.0]) | {"seeds": [7]}
+    longer = run_of_three_seeds("mappo_l", 0.5, [50.0]) | {"seeds": [8], "steps": list(range(20, 220, 20))}
+    (tmp_path / "x.json").write_text(json.dumps([first, ours]))
+    (tmp_path / "y.json").write_text(json.dumps([more]))
+    (whole,) = [run for run in study.joined(runs.load(tmp_path / "x+y.json")) if run["method"] == "mappo_l"]
+    assert whole["seeds"] == [0, 1, 7] and len(whole["true_step_cost"]) == 3
+    assert study.measures(whole)["end"].tolist() == [10.0, 12.0, 14.0]
+    assert " -8.3 [" in study.as_equivalence(tmp_path / "x+y.json")  # 110 of 120
+    assert len(study.joined([first, first, longer])) == 2
+
+
 def test_the_harm_is_corrected_over_all_lines(tmp_path: pathlib.Path):
     rng = np.random.default_rng(0)
     samples = [(rng.normal(5, 1, 12).tolist(), rng.normal(5 + shift, 1, 12).tolist()) for shift in (0.3, 1, 1.5)]
@@ -790,10 +801,12 @@ def test_equivalence_is_what_an_interval_within_the_bounds_shows(tmp_path: pathl
 def test_a_printed_table_is_shown_with_what_made_it(tmp_path: pathlib.Path):
     row = {"task": "lane", "method": "mappo", "seeds": 20, "steps": 10_004_480, "limit": 10.0}
     row |= {"reward": [1234.4, 1200.0, 1300.0], "cost": [2.345, 2.0, 3.0], "within": 19}
-    made = {"command": "pmt x", "device": "GPU", "devices": 2, "seconds": 90, "rows": [row]}
+    timed = {"command": "pmt y", "device": "GPU", "devices": 1, "seconds": 30, "runs": 5}
+    made = {"command": "pmt x", "device": "GPU", "devices": 2, "seconds": 90, "rows": [row], "timed": [timed]}
     (tmp_path / "x.json").write_text(json.dumps(made))
     title, _, head, _, line = runs.as_printed(tmp_path / "x.json").splitlines()
-    assert title.startswith("`pmt x`, 20 runs of 10 M steps in 1.5 minutes on 2 x GPU")
+    assert title.startswith("`pmt x`, 20 runs of 10 M steps in 1.5 minutes on 2 x GPU; `pmt y`, 5 runs of 10 M")
+    assert title.endswith(" in 0.5 minutes on 1 x GPU, all compiling included:")
     assert "`lane` (limit 10)" in head and line == "| `mappo` | 1,234 [1,200, 1,300] / 2.35, 19 of 20 |"
 
 
