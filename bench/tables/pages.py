@@ -110,6 +110,7 @@ def as_switches(_: str) -> str:
         order = f"{method.order}, {'one shared actor' if method.share_actor else 'an actor each'}"
         cost = "-" if method.constraint == "none" else str(method.cost_signal)
         surrogate = "as printed" if method.letter else method.surrogate.replace("_", " ")
+        surrogate = "-" if method.constraint == "trust_region" else surrogate
         rest = [method.ratio_weight, surrogate, method.critic]
         body.append([f"`{name}`", order, method.constraint.replace("_", " "), cost, *rest])
     columns = ("method", "update", "constraint", "cost signal", "ratio weight", "surrogate", "critics see")

@@ -76,6 +76,8 @@ class Method:
                 raise UsageError(f"a method's {name} must be True or False, not {getattr(self, name)!r}")
         if self.cost_signal not in ("cost", "fear") and not callable(self.cost_signal):
             raise UsageError(f"a method's cost_signal must be cost, fear or a function, not {self.cost_signal!r}")
+        if self.share_actor and self.order != "simultaneous":
+            raise UsageError("a method's share_actor needs order simultaneous, for one actor has no turns to take")
         if self.letter and (self.order, self.constraint, self.surrogate) != ("sequential", "lagrangian", "clipped"):
             raise UsageError("a method's letter needs order sequential, constraint lagrangian and surrogate clipped")
 

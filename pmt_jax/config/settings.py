@@ -94,7 +94,7 @@ class Hyper:
     lambda_lr: float = constraint(
         1.0,
         "how far costs of twice the limit in every update of the run move the multiplier: the logarithm of what it is "
-        "multiplied by, and for mappo_pid what is added to it",
+        "multiplied by, and for mappo_pid what is added to it; with the letter the step in each update",
         NOT_NEGATIVE,
     )
     lambda_kp: float = constraint(

@@ -179,8 +179,8 @@ def respond(
 ) -> Constraint:
     """One agent's constraint [K] after its policy has changed.
 
-    The letter's multiplier adds I of `surrogate_cost` to its excess. Other methods leave it out: after an update I
-    is below 0 however high the cost, so the cost would settle above the limit.
+    The letter's multiplier adds I of `surrogate_cost` to its excess. Other methods leave it out: where an update lowers
+    the cost I is below 0 however high the cost still is, so it would settle above the limit.
 
     Args:
       samples: the agent's, [R, ...]; excess: [K]; log_ratio: [R], by how much the policy changed.
@@ -205,10 +205,10 @@ def surrogate_cost(log_ratio: jax.Array, log_weight: jax.Array, cost_advantage: 
     """The change in cost that a policy's update is expected to bring: I = mean(rho A_c) (Eq. 16).
 
     Args:
-      log_ratio, log_weight: [...], after the update; cost_advantage: [..., K], centred.
+      log_ratio, log_weight: [...], after the update; cost_advantage: [..., K].
 
     Returns:
-      [K] in units of the limit.
+      [K], in the unit of `cost_advantage`.
     """
     ratio = jnp.exp(log_ratio + log_weight)
     return jnp.mean(ratio[..., None] * cost_advantage, axis=tuple(range(ratio.ndim)))

@@ -6,14 +6,16 @@ to a program. With it every state of the task is checked too, before the vector 
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import chex
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 
 from .. import tasks
@@ -52,7 +54,7 @@ def watched(setup: Setup, update: jax.Array) -> tasks.VectorEnv:
     if not setup.debug:
         return setup.vector
     vector = copy.copy(setup.vector)
-    vector.resets_all = True  # checkify knows no loop under a vmap
+    vector.resets_all = True  # a loop over resets would hide their checks, see `_loops_hidden`
     vector.env = _Watched(vector.env, functools.partial(check_finite, setup, update))
     return vector
 
@@ -88,8 +90,48 @@ def checked(program: Callable[..., Any]) -> Callable[..., Any]:
 
     def run(*arguments: Any) -> Any:
         try:
-            return chexified(*arguments)
+            with _loops_hidden():  # the first call traces
+                return chexified(*arguments)
         except AssertionError as error:
             raise NotFinite(str(error).partition("Custom message: ")[2].partition(". [failed")[0]) from None
 
     return run
+
+
+@contextlib.contextmanager
+def _loops_hidden() -> Iterator[None]:
+    """Inside, what is traced has loops of `jax.lax.while_loop` that checkify does not look into.
+
+    It refuses a loop that was vmapped, of a task or of a trust region. To it a function with a rule of its own for vmap
+    is one operation, also after vmap if the rule gives such a function again.
+    """
+    loop = jax.lax.while_loop
+
+    def hidden(proceed: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any) -> Any:
+        leaves, tree = jax.tree.flatten(start)
+
+        def run(*leaves: jax.Array) -> list[jax.Array]:
+            return jax.tree.leaves(loop(proceed, body, jax.tree.unflatten(tree, leaves)))
+
+        traced = jax.make_jaxpr(run)(*leaves)  # what it closes over becomes its first arguments
+        count = len(traced.consts)
+        flat = _one_operation(lambda *x: jax.core.eval_jaxpr(traced.jaxpr, x[:count], *x[count:]))
+        return jax.tree.unflatten(tree, flat(*traced.consts, *leaves))
+
+    jax.lax.while_loop = hidden
+    try:
+        yield
+    finally:
+        jax.lax.while_loop = loop
+
+
+def _one_operation(function: Callable[..., Any]) -> Callable[..., Any]:
+    operation = jax.custom_batching.custom_vmap(function)
+
+    @operation.def_vmap
+    def batched(size: int, axes: list[bool], *arguments: jax.Array) -> tuple[Any, Any]:
+        each = jax.vmap(function, [0 if axis else None for axis in axes], axis_size=size)
+        out = _one_operation(each)(*arguments)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return operation

@@ -61,10 +61,10 @@ def appraise_fear(
     seen = batch.next_state if setup.config.fear_time == "next" else batch.state
     signal = jax.nn.sigmoid(setup.nets.fear(net.params, seen))
     state, cost, answer = jax.tree.map(flatten_steps, (seen, batch.cost, signal))
-    memory_key, draw_key = jax.random.fold_in(key, 3), jax.random.fold_in(key, 4)
+    fit_key, memory_key, draw_key, noise_key = jax.random.split(key, 4)  # `fit` splits its own once more
     net = remember(net, state, answer, memory_key)
     replayed = draw(net, len(state), draw_key)
-    noise = jax.random.logistic(jax.random.fold_in(key, 2), cost.shape)
+    noise = jax.random.logistic(noise_key, cost.shape)
 
     def loss(params: Params, samples: tuple[jax.Array, ...]) -> tuple[jax.Array, Metrics]:
         *states, cost, noise, answer = samples
@@ -76,7 +76,7 @@ def appraise_fear(
     limits = {"learning_rate": now.emotion_lr, "max_grad_norm": hyper.max_grad_norm}
     samples = (state, replayed[0], cost, noise, replayed[1])
     learned, metrics = jax.vmap(
-        lambda net, samples: fit(net, loss, samples, key, **limits, **passes), in_axes=(0, (None, None, 1, 1, 1))
+        lambda net, samples: fit(net, loss, samples, fit_key, **limits, **passes), in_axes=(0, (None, None, 1, 1, 1))
     )(TrainState(net.params, net.opt_state), samples)
     net = dataclasses.replace(net, params=learned.params, opt_state=learned.opt_state)
     return net, signal, {**{k: x.mean(0) for k, x in metrics.items()}, **fear.calibration(signal, batch.cost)}

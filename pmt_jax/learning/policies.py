@@ -120,12 +120,15 @@ def _sequential(
 def _simultaneous(
     setup: Setup, hyper: Hyper, now: Schedule, team: Team, tagged: dict[Tag, jax.Array]
 ) -> tuple[TrainState, Constraint, Metrics]:
-    """Updates all agents from the same policies; a shared actor is fitted to the samples of all agents."""
+    """Updates all agents from the same policies.
+
+    A shared actor is fitted to the samples of all agents, and held to the limit of the one that is furthest beyond.
+    """
     actor, constraint, samples, excess = team
     actors = setup.nets.num_actors
     keys = jax.vmap(jax.random.fold_in, (None, 0))(tagged[Tag.ACTOR], jnp.arange(actors))
     per_actor = jax.tree.map(lambda x: x.reshape(actors, -1, *x.shape[2:]), samples)
-    excesses = (excess + constraint.lowered).reshape(actors, -1, excess.shape[-1]).mean(1)
+    excesses = (excess + constraint.lowered).reshape(actors, -1, excess.shape[-1]).max(1)
     actor, reach, metrics = jax.vmap(lambda *each: update_policy(setup, hyper, now, *each))(
         actor, per_actor, excesses, keys
     )

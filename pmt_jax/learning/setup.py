@@ -160,6 +160,10 @@ def make_setup(
         raise UsageError(
             f"{label(config.method)} has the paper's networks, which remember nothing; leave out recurrent"
         )
+    if method.letter and config.gamma == 1:
+        raise UsageError(
+            f"{label(config.method)} judges costs by 1 - gamma times their value, which is 0 at gamma = 1; take less"
+        )
     if method.constraint == "lagrangian" and not method.letter and config.lambda_max and not config.lambda_init:
         raise UsageError(
             "a multiplier of 0 never moves, for it changes in proportion to itself; set lambda_init above 0"

@@ -39,7 +39,7 @@ def trust_region_step(
     """One constrained step (MACPO): direction, line search. The optimiser's state is not touched.
 
     This is CPO's update (Achiam et al., 2017, section 6), as MACPO takes it for one agent. Of several costs it
-    constrains the one most beyond its limit.
+    constrains the one most beyond its limit, in standard deviations of its advantage.
 
     Args:
       violation: [K] in units of the limit, how far each cost is beyond what it is held to.
@@ -149,7 +149,7 @@ def _precision() -> contextlib.AbstractContextManager[object]:
 
 
 def _most_violated(samples: PolicySamples, violation: jax.Array) -> tuple[PolicySamples, jax.Array]:
-    """The samples with the one cost that is most beyond its limit, and by how much [] it is."""
+    """The samples with the cost most beyond its limit, in standard deviations of its advantage, and how far [] it is."""
     spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
     worst = jnp.argmax(violation / spread)
     return dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst]), violation[worst]

@@ -90,7 +90,7 @@ def _of_limit(setup: Setup) -> list[str]:
             f"note: {config.num_envs} environments make {steps:,} steps each, less than the {horizon:,} of an episode, "
             "so its cost is hardly measured; raise --steps or lower --num-envs"
         )
-    elif setup.method.constraint == "lagrangian" and min(given.each) > 0:
+    elif setup.method.constraint == "lagrangian" and not setup.method.letter and min(given.each) > 0:
         found += _of_multiplier(config, given)
     return found
 

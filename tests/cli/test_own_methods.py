@@ -139,6 +139,11 @@ def test_somebody_elses_method_is_executed_only_if_trusted(
             ":doubled",
             "share_actor must be True or False, not 'no'",
         ),
+        (
+            FILE.replace("cost_signal=harm", "share_actor=True"),
+            ":doubled",
+            "share_actor needs order simultaneous, for one actor has no turns to take",
+        ),
         (None, ":x", "there is no file"),
     ],
 )

@@ -99,3 +99,13 @@ def test_the_kernels_compute_what_xla_computes(
         right = jax.vmap(functools.partial(expected, module))(params, x, weight)
     for found, exact in zip((out, gradient), right, strict=True):
         np.testing.assert_allclose(found, exact, rtol=0, atol=1e-5 * float(np.abs(exact).max()))
+
+
+def test_places_in_a_batch_of_many_rows_have_64_bits(tmp_path: pathlib.Path):
+    module = MLP((128, 128), 1, 1.0, "relu", True, False)
+    params = jax.eval_shape(module.init, jax.random.key(0), jnp.zeros(29))
+    for rows, kind in ((2**20, "int"), (2**22, "long")):
+        header = network_of(module, 29, params).header(rows, False, 1)
+        assert f"constexpr {kind} MOMENTS_AT[]" in header and f"constexpr int ROWS = {rows};" in header
+        (tmp_path / "network.cpp").write_text(header)  # which does not narrow a number
+        subprocess.run([str(COMPILER), "-fsyntax-only", "-std=c++17", str(tmp_path / "network.cpp")], check=True)

@@ -77,13 +77,34 @@ def test_the_loss_is_the_reversed_divergence_and_the_change_of_what_was_said_of_
     nets = F4SG.setup.nets
     rows = batch.state.reshape(-1, batch.state.shape[-1])
     cost = np.asarray(batch.cost).reshape(len(rows), 2, 1) * 0.98 + 0.01
-    noise = jax.random.logistic(jax.random.fold_in(key, 2), cost.shape)
+    _, _, draw_key, noise_key = jax.random.split(key, 4)
+    noise = jax.random.logistic(noise_key, cost.shape)
     b = np.clip(jax.nn.sigmoid((nets.fear(net.params, rows) + noise) / letter.TEMPERATURE), 1e-6, 1 - 1e-6)
     divergence = b * np.log(b / cost) + (1 - b) * np.log((1 - b) / (1 - cost))
-    stored, said = letter.draw(after, len(rows), jax.random.fold_in(key, 4))
+    stored, said = letter.draw(after, len(rows), draw_key)
     change = np.asarray(jax.nn.sigmoid(nets.fear(net.params, stored)) - said)
     np.testing.assert_allclose(metrics["loss"], divergence.mean() + 0.5 * (change**2).mean(), rtol=1e-4)
     assert (change**2).mean() > 0.01
+
+
+def test_the_order_of_samples_has_nothing_to_do_with_their_noise(monkeypatch):
+    """`fit` splits its key into one an epoch, which are the numbers that `fold_in` would make of it."""
+    keys, (state, batch) = {}, acted("f4sg_letter")
+    for name, of, place in (("fit", letter.fit, 3), ("remember", letter.remember, 3), ("draw", letter.draw, 2)):
+
+        def spy(*given, name=name, of=of, place=place, **more):
+            keys[name] = given[place]
+            return of(*given, **more)
+
+        monkeypatch.setattr(letter, name, spy)
+    logistic = jax.random.logistic
+    monkeypatch.setattr(jax.random, "logistic", lambda key, shape: logistic(keys.setdefault("noise", key), shape))
+    now = schedules.at(F4SG.setup.config, F4SG.setup.hyper, jnp.int32(0))
+    net = state.fear
+    letter.appraise_fear(F4SG.setup, F4SG.setup.hyper, now, net, batch, jnp.ones((2, 1)), jax.random.key(7))
+    orders = {jax.random.key_data(key).tobytes() for key in jax.random.split(keys.pop("fit"), 50)}
+    others = {jax.random.key_data(key).tobytes() for key in keys.values()}
+    assert len(others) == 3 and not others & orders
 
 
 def test_fear_of_a_batch_is_that_of_the_networks_before_they_learned_from_it():

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmt_jax import load_config, make_setup
+from pmt_jax import METHODS, load_config, make_setup
 from pmt_jax.learning import learner
 from pmt_jax.learning.evaluation import evaluate
 from pmt_jax.learning.types import Best, LearnerState
@@ -117,6 +117,20 @@ def test_a_row_names_each_agent(run: pathlib.Path):
     first, last = rows(run)[0], rows(run)[-1]
     assert last["lambda/agent_0"] > first["lambda/agent_0"] > 2 > first["lambda/agent_1"] > last["lambda/agent_1"]
     assert last["lambda"] == pytest.approx((last["lambda/agent_0"] + last["lambda/agent_1"]) / 2)
+
+
+@pytest.mark.full
+def test_a_shared_actor_is_held_to_the_limit_of_the_worst_agent(file: pathlib.Path, monkeypatch):
+    """On average the agents of `Lop` are within their limit."""
+    row = dataclasses.replace(METHODS["p3o"], order="simultaneous", share_actor=True)
+    monkeypatch.setitem(METHODS, "p3o_shared", row)
+    sizes = {"num_envs": 8, "rollout_length": 25, "hidden": (16,), "epochs": 1, "minibatches": 1, "log_interval": 1}
+    monkeypatch.chdir(file.parent)
+    with trusting():
+        config = load_config(f"{file}:Lop", method="p3o_shared", steps=600, cost_limit=10.0, **sizes)
+        _, metrics = jax.jit(learner.make_train(config))(jax.random.key(0))
+    assert (metrics["cost_excess/agent_0"][1:] > 0).all() and (metrics["cost_excess/agent_1"] < 0).all()
+    assert (metrics["actor/penalty"][1:] > 0).all()
 
 
 @pytest.mark.full

@@ -9,6 +9,7 @@ import re
 import shutil
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -193,6 +194,32 @@ def test_debug_names_the_first_tensor_that_is_not_finite():
     run = checked(jax.jit(jax.vmap(program, axis_name=SEEDS)))
     with pytest.raises(NotFinite, match=r"^batch\['reward'\] of seed 6 is not finite in update 7$"):
         run(jnp.array([3.0, 1.0]))
+
+
+def test_debug_looks_at_what_comes_out_of_loops_under_a_vmap():
+    """checkify knows no loop that was vmapped, and tasks and trust regions have some."""
+
+    def program(x: jax.Array, most: jax.Array) -> jax.Array:
+        start = (x, jnp.int32(0))
+        doubled, _ = jax.lax.while_loop(
+            lambda at: (at[0] < most) & (at[1] < 5), lambda at: (at[0] * 2, at[1] + 1), start
+        )
+        chex.assert_tree_all_finite(doubled, custom_message="doubled")
+        return doubled
+
+    both = jax.vmap(jax.vmap(program, (0, None)), (None, 0))
+    run, x, most = checked(jax.jit(both)), jnp.array([1.0, 2.0, 3.0]), jnp.array([10.0, 1e9])
+    np.testing.assert_array_equal(run(x, most), [[16, 16, 12], [32, 64, 96]])
+    with pytest.raises(NotFinite, match="^doubled$"):
+        run(x.at[1].set(jnp.inf), most)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("arguments", [("lane", "--method", "macpo"), ("voltage_33",), ("multi_goal_point_1",)])
+def test_debug_knows_the_loops_of_methods_and_tasks(arguments, tmp_path, cli):
+    sizes = ("--num-envs", 2, "--rollout-length", 4, "--hidden", 4, "--minibatches", 1, "--epochs", 1, "--steps", 8)
+    code, text, _ = cli("train", *arguments, *sizes, "--debug", "--out", tmp_path / "run")
+    assert code == 0 and "done: 8 steps" in text
 
 
 def test_debug_adds_nothing_where_it_is_off():

@@ -82,9 +82,15 @@ class _Network:
         lists = {"WIDTH": self.widths, "NORMED": self.normed, "KERNEL_AT": kernel, "BIAS_AT": bias, "SCALE_AT": scale}
         lists |= {"OFFSET_AT": offset, "ACTIVE_AT": active, "INPUT_AT": inputs, "MOMENTS_AT": moments}
         lists |= {"DELTA_AT": delta, "NORMAL_AT": normal}
-        lines = [f"constexpr int {name} = {number};" for name, number in numbers.items()]
-        lines += [f"constexpr int {name}[] = {{{', '.join(map(str, map(int, x)))}}};" for name, x in lists.items()]
+        lines = [f"constexpr {_integer(number)} {name} = {number};" for name, number in numbers.items()]
+        for name, x in lists.items():
+            lines.append(f"constexpr {_integer(*x)} {name}[] = {{{', '.join(map(str, map(int, x)))}}};")
         return "\n".join(lines) + "\n"
+
+
+def _integer(*values: int) -> str:
+    """The type in C that holds the values: places in the rows of a large batch need 64 bits."""
+    return "int" if max(values) < 2**31 else "long"
 
 
 def _begin(sizes: list[int], together: int) -> tuple[list[Any], int]:
