@@ -76,9 +76,9 @@ def make(name: str, **options: Any) -> Env:
     """
     cls, fixed, known = _find(name)
     for option in options:
-        if option == "physics" and option not in known:
+        if option == "physics" and option not in known and not _takes_any(cls):
             raise TaskError(f"task '{name}' is plain JAX and has no physics engine to choose; leave physics = auto")
-        if option not in known:
+        if option not in known and not _takes_any(cls):
             raise TaskError(f"task '{name}' has no option '{option}'{did_you_mean(option, known)}")
     return user.build(cls, name, options) if user.is_file(name) else cls(**fixed, **options)
 
@@ -88,8 +88,10 @@ def columns(name: str) -> Mapping[str, Column]:
 
     A free partition of a robot, like ant_6_2, has the columns of the robot's other tasks.
     """
+    if name in _TASKS:
+        return _TASKS[name].columns
     families = {known.split("_")[0]: task.columns for known, task in _TASKS.items()}
-    return _TASKS[name].columns if name in _TASKS else families.get(name.split("_")[0], {})
+    return families.get(name.split("_")[0], {}) if re.fullmatch(r"[a-z_]+(_\d+)+", name) else {}
 
 
 def task_options(name: str) -> dict[str, Any]:
@@ -122,5 +124,11 @@ def _find(name: str) -> tuple[Callable[..., Any], dict[str, Any], dict[str, Any]
         cls, fixed = getattr(importlib.import_module(f".{task.module}", __name__), task.cls), task.options
     else:
         raise TaskError(f"unknown task '{name}'{did_you_mean(name, names())} (pmt envs lists all)")
-    parameters = inspect.signature(cls).parameters.values()
-    return cls, fixed, {p.name: p.default for p in parameters if p.name not in fixed}
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    named = [p for p in inspect.signature(cls).parameters.values() if p.kind not in several]
+    return cls, fixed, {p.name: p.default for p in named if p.name not in fixed}
+
+
+def _takes_any(make: Callable[..., Any]) -> bool:
+    """Whether it has `**options`, which it hands on."""
+    return any(p.kind is inspect.Parameter.VAR_KEYWORD for p in inspect.signature(make).parameters.values())

@@ -72,6 +72,7 @@ class EnvSpec:
         if np.shape(self.action_mask) != shape or not np.isin(self.action_mask, (0, 1)).all():
             found = f"an array of shape {np.shape(self.action_mask)}"
             raise TaskError(f"spec.action_mask must hold 0 and 1 in shape {shape} (agents, actions), not {found}")
+        object.__setattr__(self, "action_mask", np.asarray(self.action_mask))
         limits = self.cost_limit if isinstance(self.cost_limit, tuple) else (self.cost_limit,) * self.num_costs
         if len(limits) != self.num_costs or any(not isinstance(x, numbers.Real) or not float(x) >= 0 for x in limits):
             wanted = f"a number of at least 0, or a tuple of {self.num_costs} of them"

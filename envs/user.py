@@ -7,6 +7,7 @@ imports neither JAX nor MuJoCo.
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib.machinery
 import importlib.util
 import inspect
@@ -99,7 +100,8 @@ class _Loader(importlib.machinery.SourceFileLoader):
 def _module(file: pathlib.Path, changed: int) -> types.ModuleType:
     """Runs `file`, anew only when it has `changed`."""
     del changed
-    name = f"pmt_user_env_{file.stem}"
+    place = hashlib.sha256(str(file).encode()).hexdigest()[:8]  # files of one name in several folders stay apart
+    name = f"pmt_user_env_{file.stem}_{place}"
     spec = importlib.util.spec_from_file_location(name, file, loader=_Loader(name, str(file)))
     assert spec and spec.loader  # a .py file has both
     module = importlib.util.module_from_spec(spec)

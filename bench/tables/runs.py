@@ -206,7 +206,7 @@ def _summaries(files: pathlib.Path) -> dict[tuple[str, str], tuple[TableRow, str
 def as_printed(file: pathlib.Path) -> str:
     """Methods by tasks, of what a command of ours printed: reward with its interval / cost, and seeds within.
 
-    Above it the runs of the command, and how long they took together; also those of other commands that were only timed.
+    Above it the runs of the command, and how long they took together; also those of commands that were only timed.
     """
     report = json.loads(file.read_text())
     printed = report["rows"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,8 +57,9 @@ class FromBrax:
         )
 
     def reset(self, key: jax.Array) -> State:
-        """The start of an episode drawn with `key`."""
-        return self._view(self._env.reset(jax.random.key_data(key)))
+        """The start of an episode drawn with `key`; no transition led there, so it has no reward and no cost."""
+        start = self._view(self._env.reset(jax.random.key_data(key)))
+        return dataclasses.replace(start, reward=jnp.zeros_like(start.reward), cost=jnp.zeros_like(start.cost))
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step with `action` [N, A], clipped to [-1, 1]."""

@@ -62,9 +62,11 @@ class JaxMarlEnv:
         self.agents = [f"agent_{i}" for i in range(spec.num_agents)]
         self._entries = [np.flatnonzero(row) for row in spec.action_mask]
         self._vector = VectorEnv(env, 1)  # ends episodes and starts new ones
-        self.observation_spaces = {agent: Box(-np.inf, np.inf, (spec.obs_dim,)) for agent in self.agents}
+        dtype = jax.eval_shape(env.reset, jax.random.key(0)).obs.dtype
+        self.observation_spaces = {agent: Box(-np.inf, np.inf, (spec.obs_dim,), dtype) for agent in self.agents}
         self.action_spaces = {
-            agent: Box(-1.0, 1.0, (len(entries),)) for agent, entries in zip(self.agents, self._entries, strict=True)
+            agent: Box(-1.0, 1.0, (len(entries),), dtype)
+            for agent, entries in zip(self.agents, self._entries, strict=True)
         }
 
     @property

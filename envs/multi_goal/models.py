@@ -29,6 +29,7 @@ class Robot:
       nq, nv: entries of qpos and qvel of one robot.
       motors: names of its actuators, in the model's order.
       on_floor: it collides with the floor.
+      reach: m from its origin, within which it may touch a vase in a step: its own size, a vase's, and a step's way.
       site: m, height of the sensors above the robot's origin, in its own frame.
       least_height: m, an episode ends where a robot's origin is not above; None if nothing ends it.
     """
@@ -39,6 +40,7 @@ class Robot:
     nv: int
     motors: tuple[str, ...]
     on_floor: bool
+    reach: float
     site: float
     least_height: float | None
 
@@ -51,6 +53,7 @@ ROBOTS = {
         nv=3,
         motors=("thrust", "turn"),
         on_floor=False,  # the ball touches it at a distance of exactly 0, which MuJoCo drops; 1e-7 deeper, it sticks
+        reach=0.36,
         site=0.0,
         least_height=None,
     ),
@@ -61,6 +64,7 @@ ROBOTS = {
         nv=14,
         motors=tuple(f"{joint}{leg}" for leg in range(1, 5) for joint in ("hip", "ankle")),
         on_floor=True,
+        reach=0.55,
         site=-0.02,
         least_height=0.08,
     ),

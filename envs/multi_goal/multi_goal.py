@@ -157,7 +157,7 @@ class MultiGoal:
         kind, robots = ROBOTS[self.robot], self.num_agents
         slots = min(int(at_least("vase_slots", slots, 1)), chosen["vases"])
         self._kind = kind
-        self.vases = Vases(robots * kind.nq, robots * kind.nv, chosen["vases"], slots)
+        self.vases = Vases(robots * kind.nq, robots * kind.nv, chosen["vases"], slots, kind.reach)
         self._plan = plan(robots, self.num_hazards, chosen["vases"], reference=not self.own)
 
     def _build_engines(self, physics: str, threads: int | None) -> None:
@@ -260,6 +260,7 @@ class MultiGoal:
         hazards: Any = None,
         vase_owner: Any = None,
         key: Any = None,
+        crowded: Any = 0,
     ) -> State:
         """A State from MuJoCo's quantities, as if no transition had led to it; motors are at rest for what it observes.
 
@@ -272,6 +273,7 @@ class MultiGoal:
           hazards: [H, 2] m; needed if the task has any.
           vase_owner: [V] agents; 0 if None.
           key: for new goals, a key or its data; that of seed 0 if None.
+          crowded: things of the layout that found no room, which the next step counts.
 
         Raises:
           TaskError: the hazards are missing, or as many as the task does not have.
@@ -288,8 +290,8 @@ class MultiGoal:
         if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
             key = jax.random.wrap_key_data(key)
         physics = PhysicsState(self._with_unit_quaternions(qpos), qvel, warmstart)
-        zero = jnp.zeros((), dtype)
-        return self._initial_state(Carry(physics, jnp.asarray(goals, dtype), hazards, owner, key, zero))
+        goals, crowded = jnp.asarray(goals, dtype), jnp.asarray(crowded, dtype)
+        return self._initial_state(Carry(physics, goals, hazards, owner, key, crowded))
 
     def raw(self, state: State) -> dict[str, jax.Array]:
         """What `restore` takes."""
@@ -303,6 +305,7 @@ class MultiGoal:
             **({"hazards": carry.hazards} if self.level else {}),
             "vase_owner": carry.vase_owner,
             "key": jax.random.key_data(carry.key),
+            "crowded": carry.crowded,
         }
 
     def decorate(self, scene: mujoco.MjvScene, raw: dict[str, np.ndarray], cost: float) -> None:

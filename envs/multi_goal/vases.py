@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from ..physics import PhysicsState
 
 MOVING = 1e-5  # m/s or rad/s, of any entry of a vase's velocity
-NEAR = 0.36  # m to a robot, within which a vase may be touched in a step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,12 +19,14 @@ class Vases:
     Attributes:
       nq, nv: entries of all robots, which come first.
       count: V; slots: K, of the model that is stepped.
+      reach: m to a robot, within which it may touch a vase in a step.
     """
 
     nq: int
     nv: int
     count: int
     slots: int
+    reach: float
 
     def qpos(self, physics: PhysicsState) -> jax.Array:
         """[V, 7]."""
@@ -41,7 +42,7 @@ class Vases:
         nearest = jnp.sqrt(jnp.sum((place[:, None] - robots) ** 2, axis=2)).min(1)
         moving = (jnp.abs(self.qvel(physics)) > MOVING).any(1)
         _, chosen = jax.lax.top_k(jnp.where(moving, jnp.inf, -nearest), self.slots)
-        active = (moving | (nearest < NEAR)).sum()
+        active = (moving | (nearest < self.reach)).sum()
         return jnp.sort(chosen), jnp.maximum(active - self.slots, 0).astype(nearest.dtype)
 
     def take(self, physics: PhysicsState, chosen: jax.Array) -> PhysicsState:

@@ -328,7 +328,7 @@ class VoltageControl:
             key = jax.random.key(0) if key is None else key
             first = self.solve_first(start_row, q, self.data_row(start_row + self._first_row), key)
             given = {k: jnp.asarray(v, getattr(first, k).dtype) for k, v in rest.items() if v is not None}
-            return self._observe(dataclasses.replace(first, **given), push="frames" not in given)
+            return self._observe(dataclasses.replace(first, key=key, **given), push="frames" not in given)
         if key is None:
             row, key = self.data_row(start_row + self._first_row), jax.random.key(0)
         else:

@@ -98,16 +98,17 @@ def pandapower_network(net: Any, inject: Sequence[int] | None = None) -> tuple[N
     lines = np.zeros(len(ppc["branch"]), bool)
     lines[first:last] = True
     grid = net.ext_grid[net.ext_grid.in_service.astype(bool)].iloc[0]
+    slack = _bus(index, grid.bus, "an external grid")
     network = _from_tables(
         np.real(ppc["bus"]),
         np.real(ppc["branch"]),
         float(ppc["baseMVA"]),
         compact,
         lines,
-        slack=_bus(index, grid.bus, "an external grid"),
+        slack=slack,
         slack_vm=float(grid.vm_pu),
         slack_va=float(np.radians(grid.va_degree)),
-        inject=None if inject is None else sorted({_bus(index, b, "power to inject") for b in inject}),
+        inject=None if inject is None else sorted({_bus(index, b, "power to inject") for b in inject} - {slack}),
         name=str(net.name or "pandapower net"),
     )
     return network, index
@@ -206,11 +207,12 @@ def pandapower_scenario(
     names = [str(z) for z in (net.bus.zone if zone is None else zone)]
     if len(names) != len(net.bus):
         raise TaskError(f"zone has {len(names)} entries, but the net has {len(net.bus)} buses")
-    regions = sorted({z for z in names if z != "main"}, key=_natural)
+    kept = {int(bus): name for bus, name in zip(net.bus.index, names, strict=True) if int(bus) in index}
+    regions = sorted({name for name in kept.values() if name != "main"}, key=_natural)
     of_bus = np.zeros(network.n_bus, int)
-    for bus, name in zip(net.bus.index, names, strict=True):
-        if name != "main" and int(bus) in index:
-            of_bus[index[int(bus)]] = 1 + regions.index(name)
+    for bus, name in kept.items():
+        if name != "main":
+            of_bus[index[bus]] = 1 + regions.index(name)
     table = {
         "load_bus": np.array([_bus(index, b, "a load") for b in loads.bus]),
         "pv_bus": np.array([_bus(index, b, "a static generator") for b in plants.bus]),

@@ -17,6 +17,7 @@ import chex
 import jax
 import jax.custom_batching
 import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from .. import tasks
 from .setup import Setup
@@ -115,7 +116,7 @@ def _loops_hidden() -> Iterator[None]:
 
         traced = jax.make_jaxpr(run)(*leaves)  # what it closes over becomes its first arguments
         count = len(traced.consts)
-        flat = _one_operation(lambda *x: jax.core.eval_jaxpr(traced.jaxpr, x[:count], *x[count:]))
+        flat = _one_operation(lambda *x: jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, x[:count]))(*x[count:]))
         return jax.tree.unflatten(tree, flat(*traced.consts, *leaves))
 
     jax.lax.while_loop = hidden

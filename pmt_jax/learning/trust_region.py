@@ -149,7 +149,7 @@ def _precision() -> contextlib.AbstractContextManager[object]:
 
 
 def _most_violated(samples: PolicySamples, violation: jax.Array) -> tuple[PolicySamples, jax.Array]:
-    """The samples with the cost most beyond its limit, in standard deviations of its advantage, and how far [] it is."""
+    """The samples with the cost furthest beyond its limit, in standard deviations of its advantage, and how far []."""
     spread = samples.cost_advantage.std(tuple(range(samples.log_prob.ndim))) + 1e-5
     worst = jnp.argmax(violation / spread)
     return dataclasses.replace(samples, cost_advantage=samples.cost_advantage[..., worst]), violation[worst]

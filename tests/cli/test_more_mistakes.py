@@ -93,7 +93,7 @@ train lane --gae-lambda 2 | gae_lambda must lie in [0, 1], not 2.0
 train lane --clip 0 | clip must be a number above 0, not 0.0
 train lane --cost-limit 1,2 | cost_limit has 2 numbers, but task 'lane' has 1 cost(s)
 train lane --cost-limit 1e39 | cost_limit must be a cost per episode of at least 0 that fits 32 bits, not 1e+39
-train lane --method f4sg_letter --gamma 1 | f4sg_letter judges costs by 1 - gamma times their value, which is 0 at gamma = 1
+train lane --method f4sg_letter --gamma 1 | f4sg_letter judges costs by 1 - gamma times their value
 train lane --cost-limit one | cost_limit = 'one' does not fit: expected a number, or one for each cost
 train lane --lambda-max 0.1 | lambda_init = 2.0 lies above lambda_max = 0.1
 train lane --method macpo --limit-lr 3 | limit_lr must lie in [0, 1], not 3.0

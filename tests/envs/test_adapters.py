@@ -376,6 +376,8 @@ assert all(x in parallel.observation_space(agent) and x.dtype == np.float64 for 
 assert parallel.state() in parallel.state_space and parallel.state().dtype == np.float64
 obs, *_ = parallel.step({agent: parallel.action_space(agent).sample() for agent in parallel.agents})
 assert obs["agent_0"].dtype == np.float64
+marl = adapters.to_jaxmarl(envs.make("lane"))
+assert marl.observation_space("agent_0").dtype == marl.action_space("agent_0").dtype == np.float64
 print("fine")
 """
     environment = {**os.environ, "JAX_ENABLE_X64": "1"}
@@ -524,6 +526,9 @@ def test_a_brax_environment_becomes_a_task():
     assert (low.spec.num_agents, low.spec.obs_dim, low.spec.action_dim) == (1, 16, 4)
     state = low.step(low.reset(jax.random.key(0)), jnp.full((1, 4), 0.3))  # to 0.12, then 0.216
     assert state.cost == 0 and low.step(state, jnp.full((1, 4), 0.3)).cost == 1
+    never = adapters.from_brax(adapters.to_brax(lane), "position", 1.0, above=-0.5)
+    start = never.reset(jax.random.key(0))
+    assert start.cost == start.reward == 0 and never.step(start, jnp.zeros((1, 4))).cost == 1
 
 
 @pytest.mark.parametrize(

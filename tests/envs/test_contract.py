@@ -320,7 +320,9 @@ def test_a_task_that_declares_nothing_has_the_defaults():
 
     declared = declarations(Minimal())
     assert declared.picture.kind == "plain" and not declared.baselines and declared.overflow is None
-    assert envs.columns("my_env.py") == {}
+    for name in ("my_env.py", "ant_mine.py", "voltage_mine", "ants"):
+        assert envs.columns(name) == {}
+    assert envs.columns("ant_6_2") == envs.columns("ant_2x4")
 
 
 def test_columns_need_no_jax():

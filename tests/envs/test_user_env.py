@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import pathlib
+import pickle
 import sys
 
 import pytest
 
 import envs
+from envs.base import EnvSpec
 from paths import ROOT
 from pmt_jax import load_config
 
@@ -159,3 +161,24 @@ def test_a_factory_takes_options(tmp_path: pathlib.Path):
     assert envs.make(f"{file}:wide", engine="mjx").engine == "mjx"
     with pytest.raises(envs.TaskError, match="has no option 'engin'; did you mean 'engine'"):
         envs.make(f"{file}:wide", engin="mjx")
+    file.write_text(
+        GOOD + "\n\ndef scaled(scale=1.0, **options):\n    env = Pole()\n    env.given = options\n    return env\n"
+    )
+    assert envs.task_options(f"{file}:scaled") == {"scale": 1.0}
+    assert envs.make(f"{file}:scaled", colour=3, physics="mjx").given == {"colour": 3, "physics": "mjx"}
+
+
+def test_files_of_one_name_are_two_modules(tmp_path: pathlib.Path):
+    made = []
+    for folder in ("first", "second"):
+        file = tmp_path / folder / "pole.py"
+        file.parent.mkdir()
+        file.write_text(GOOD)
+        made.append(envs.make(str(file)))
+    for env in made:
+        assert isinstance(pickle.loads(pickle.dumps(env)), type(env))
+
+
+def test_a_mask_may_be_a_list():
+    spec = EnvSpec("mine", 2, 3, 1, 3, 1, 10, [[1.0], [1.0]], 1.0)  # pyright: ignore[reportArgumentType]
+    assert spec.action_mask.shape == (2, 1)

@@ -22,6 +22,7 @@ from envs.multi_goal.models import COLOURS
 from envs.multi_goal.multi_goal import KINDS, VASE_HEIGHT
 from envs.multi_goal.scene import HAZARD_COLOUR
 from envs.multi_goal.sensing import SENSORS
+from envs.multi_goal.vases import Vases
 from envs.physics import PhysicsState, contract
 from envs.physics.fused import nvrtc
 from paths import DATA
@@ -252,6 +253,22 @@ def test_costs_are_the_agents_own():
     assert float(at_vase.info["cost_vases_velocity_1"]) == 1.0 and float(taken.info["cost_vases_contact_0"]) == 0.0
     for state in (in_hazard, touching, at_vase):
         np.testing.assert_allclose([state.info[x] for x in ("hazards", "vases", "robots")], state.cost.mean(0))
+
+
+def test_vases_within_a_robots_reach_need_a_slot():
+    """An ant's leg touches a vase further from its middle than a point does."""
+    at_rest = PhysicsState(jnp.zeros((2, 7)).at[:, 0].set(jnp.array([0.3, 0.5])).ravel(), jnp.zeros(12), jnp.zeros(12))
+    for robot, more in (("point", 0), ("ant", 1)):
+        _, left_out = Vases(0, 0, 2, 1, models.ROBOTS[robot].reach).choose(at_rest, jnp.zeros((1, 2)))
+        assert left_out == more
+
+
+def test_what_found_no_room_is_counted_after_restore_too():
+    env = envs.make("multi_goal_point_0", wiring="own", physics="mujoco")
+    resets = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 8))
+    restored = jax.vmap(lambda state: env.restore(**env.raw(state)))(resets)
+    assert resets.carry.crowded.any()
+    np.testing.assert_array_equal(restored.carry.crowded, resets.carry.crowded)
 
 
 def test_vases_without_a_slot_that_move_are_counted():

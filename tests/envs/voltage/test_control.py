@@ -96,8 +96,9 @@ def test_specs_are_mapdns() -> None:
 
 
 @pytest.mark.full
-def test_raw_is_the_inverse_of_restore_in_mid_episode_and_with_noise() -> None:
-    env = folder_env(noise=True, history=2)
+@pytest.mark.parametrize("timing", ["mapdn", "plain"])
+def test_raw_is_the_inverse_of_restore_in_mid_episode_and_with_noise(timing: str) -> None:
+    env = folder_env(noise=True, history=2, timing=timing)
     step = jax.jit(env.step)
     state = step(jax.jit(env.reset)(jax.random.key(3)), jnp.full((6, 1), 0.3))
     again = jax.jit(lambda state: env.restore(**env.raw(state)))(state)
