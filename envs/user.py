@@ -259,7 +259,14 @@ def guard(what: str, run: Callable[[], Any]) -> Any:
     except (Exception, SystemExit) as error:  # a user's file may raise anything
         lines = traceback.extract_tb(error.__traceback__)
         # Neither ours nor of a package that the user's code calls, as JAX; <string> is a dataclass.
-        others = (str(pathlib.Path(__file__).parent), "<", sysconfig.get_path("purelib"), sysconfig.get_path("platlib"))
+        here = pathlib.Path(__file__).parent
+        others = (
+            f"{here}/",
+            f"{here.with_name('pmt_jax')}/",
+            "<",
+            sysconfig.get_path("purelib"),
+            sysconfig.get_path("platlib"),
+        )
         own = [line for line in lines if not line.filename.startswith(others)]
         line = (own or lines)[-1]
         place = f"{pathlib.Path(line.filename).name}, line {line.lineno}"

@@ -25,14 +25,15 @@ def writing(out: pathlib.Path, flag: str = "-o") -> Iterator[pathlib.Path]:
     """
     if not out.name:  # "", "." and "/", next to which no file can lie
         raise UsageError(f"cannot write {out}: it is a folder; choose another {flag}")
-    partial = out.with_stem(f".{out.stem}.partial")
+    target = pathlib.Path(os.path.realpath(out)) if out.is_symlink() else out  # a link stays one
+    partial = target.with_stem(f".{target.stem}.partial")
     try:
         if _is_stream(out):
             yield out  # is written and never replaced
             return
-        out.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        partial.replace(out)
+        partial.replace(target)
     except OSError as error:
         raise UsageError(f"cannot write {out}: {error.strerror or error}; choose another {flag}") from error
     finally:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import UsageError
+from ..files import to_stderr
 from ..output import check_written, result, say
 from ..trust import check_source, trusting
 from .flags import add_settings, given
@@ -202,6 +203,9 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
 
     out = arguments.out or pathlib.Path("runs") / f"reproduce-{arguments.budget}"
     wanted = (arguments.table, arguments.budget, arguments.seeds)
-    code = reproduce.reproduce(*wanted, out, arguments.format, _launch(arguments))
+    launch = _launch(arguments)
+    if arguments.format != "text":  # which other programs read
+        launch = launch._replace(say=to_stderr)
+    code = reproduce.reproduce(*wanted, out, arguments.format, launch)
     check_written()
     return code

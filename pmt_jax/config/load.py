@@ -68,6 +68,8 @@ def load_config(
     if "task" not in values:
         raise UsageError(f'{source} names no task; add extends = "TASK" with one that pmt envs lists')
     values["task"] = absolute(str(values["task"]))
+    if (init := str(values.get("init", ""))) and not init.startswith("hub:"):
+        values["init"] = str(pathlib.Path(init).expanduser().absolute())
     converted: dict[str, Any] = {name: convert(name, value) for name, value in values.items()}
     converted["method"] = method
     return Config(**converted)

@@ -66,14 +66,15 @@ def _networks(config: Config, like: LearnerState, index: jax.Array) -> dict[str,
     """What the run that `config` names has learned of all that both have, for the seeds at `index` [seeds] of it."""
     source = config.init
     made, state = load_run(pathlib.Path(source))
+    names = LEARNED if isinstance(state, LearnerState) else ACTING
+    both = [name for name in names if None not in (getattr(state, name), getattr(like, name))]
+    parts = {name: (_learned(getattr(state, name)), getattr(like, name)) for name in both}
+    taken = {name: _taken(source, name, *part, index) for name, part in parts.items()}
     for name in FUNCTION:
         if (given := getattr(made.config, name)) != getattr(config, name):
             flag = f"--{name.replace('_', '-')} {given}"
             raise UsageError(f"the networks of {source} have {name} = '{given}', this run's do not; add {flag}")
-    names = LEARNED if isinstance(state, LearnerState) else ACTING
-    both = [name for name in names if None not in (getattr(state, name), getattr(like, name))]
-    parts = {name: (_learned(getattr(state, name)), getattr(like, name)) for name in both}
-    return {name: _taken(source, name, *part, index) for name, part in parts.items()}
+    return taken
 
 
 def _taken(source: str, name: str, theirs: Any, like: Any, index: jax.Array) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from ..config.methods import METHODS
 from ..errors import UsageError
+from ..output import result
 from ..tasks import did_you_mean, names
 from ..training import lock
 from . import table
@@ -59,8 +60,9 @@ def reproduce(
     if code:
         return code
     logs = read_all([out / task / point for task, points in plans.items() for point in points])
-    launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
-    launch.say(table.render(rows(logs), layout, wanted["baseline"]))
+    if layout == "text":
+        launch.say(f"\n{wanted['title']}, budget '{budget}'\n")
+    result(table.render(rows(logs), layout, wanted["baseline"]))
     return 0
 
 

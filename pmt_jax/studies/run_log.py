@@ -263,9 +263,10 @@ def read(folder: pathlib.Path, note: Note = to_stderr) -> RunLog | None:
 
 def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
     """The points of sweeps at and below `path` that have not ended, as far as they are; each names its later folder."""
-    found = []
+    found: dict[pathlib.Path, RunLog] = {}
     hidden = ((folder, name) for folder, inner, _ in _walk(path) for name in inner if name.startswith(".group-"))
-    for group in sorted(folder / name for folder, name in hidden):
+    groups = [folder / name for folder, name in hidden]
+    for group in sorted(groups, key=lambda group: (group.parent, -int(group.name.split("-")[1]))):
         metrics = group / "run" / "metrics.jsonl"
         try:
             configs = {file.stem: _config(file) for file in program_folder.point_files(group)}
@@ -275,11 +276,16 @@ def _under_way(path: pathlib.Path, note: Note) -> list[RunLog]:
                 continue
             raise
         missing = [name for name in rows if rows[name] and not (group.parent / name / "config.toml").is_file()]
-        logs = [_log(group.parent / name, rows[name], metrics, configs[name], note) for name in missing]
-        if logs:
-            note(f"not ended: {len(logs)} point(s) of {group.parent}, read at step {logs[0].steps[-1]:,}")
-        found += logs
-    return found
+        places = {group.parent / name: name for name in missing}
+        logs = {
+            place: _log(place, rows[name], metrics, configs[name], note)
+            for place, name in places.items()
+            if place not in found  # of groups that hold the same points, the latest counts
+        }
+        for log in [*logs.values()][:1]:
+            note(f"not ended: {len(logs)} point(s) of {group.parent}, read at step {log.steps[-1]:,}")
+        found |= logs
+    return [*found.values()]
 
 
 def _log(

@@ -199,11 +199,21 @@ def _finished(folder: pathlib.Path, config: Config) -> bool:
 
 
 def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
-    """What trains together and where: groups begun earlier that are still wanted as they are, then new ones."""
+    """What trains together and where: groups begun earlier that are still wanted as they are, then new ones.
+
+    Raises:
+      UsageError: one that was begun has a missing point of the same name with other settings.
+    """
     left = dict(missing)
     begun = sorted(out.glob(".group-*"), key=lambda p: int(p.name.split("-")[1]))
     for folder in begun:
         group = program_folder.points(folder)
+        for name in group.keys() & left.keys():
+            if changes := differences(group[name], left[name]):
+                listed = ", ".join(f"{setting}: {change}" for setting, change in changes.items())
+                raise UsageError(
+                    f"{folder} has begun '{name}' with other settings ({listed}); choose another --out, or delete it"
+                )
         wanted = all(repr(points.get(name)) == repr(config) for name, config in group.items())
         if wanted and any(name in left for name in group):
             left = {name: config for name, config in left.items() if name not in group}

@@ -64,9 +64,9 @@ def _advice(log: RunLog, beyond: Sequence[int]) -> str:
     constraint = _constraint(log)
     if constraint == "none":
         return f"{log.method} has no constraint; train one that has: --method mappo_l or f4sg"
-    limit, seeds = log.limits.total, np.array(log.seeds)[beyond]
+    limit, seeds = log.limits_on(log.judged_cost).total, np.array(log.seeds)[beyond]
     bound = log.settings.get("lambda_max", np.inf)
-    cost = log.metrics["episode_cost"][beyond]
+    cost = log.metrics[log.judged_cost][beyond]
     before, last = (_mean(cost, log.steps, begin) for begin in (0.8, 0.9))
     held = (_multiplier(log)[beyond] >= AT_BOUND * bound) & (constraint in ("lagrangian", "pid"))
     if held.any():

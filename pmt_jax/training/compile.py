@@ -20,6 +20,7 @@ import numpy as np
 
 from .. import tasks
 from ..errors import UsageError
+from ..files import to_stderr
 from ..learning import debug, learner, sharding
 from ..learning.evaluation import evaluate
 from ..learning.maths import running_moments
@@ -28,6 +29,7 @@ from ..learning.types import ActingState, Hyper, LearnerState, Metrics
 from ..output import Say
 from . import chunks, final
 
+ANEW = "every start compiles anew"
 FLOAT = 4  # bytes
 KERNEL_LINES = 5.0  # seconds between two of them
 KERNEL_THREADS = max(1, min(8, (os.cpu_count() or 1) - 1))  # one CPU is XLA's; Warp writes one source at a time
@@ -61,11 +63,14 @@ def cache_folder() -> pathlib.Path:
 
 
 def use_cache() -> None:
-    """Keeps compiled programs in `cache_folder()`; nowhere if the user has no home."""
+    """Keeps compiled programs in `cache_folder()`; nowhere if the user has no home, or one that cannot be written."""
     if not getattr(jax.config, "jax_compilation_cache_dir", None):
         try:
             folder = cache_folder()
         except RuntimeError:
+            return
+        if not os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK):
+            to_stderr(f"compiled programs are not kept, for {folder} cannot be written; {ANEW}")
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

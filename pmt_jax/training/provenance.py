@@ -112,10 +112,11 @@ def check_settings(
     if not refused:
         return
     advice = "resume it unchanged (only --steps may grow), add --change to continue with the new ones"
-    if change:
-        advice = f"--change cannot change {', '.join(refused)}; leave them as they are"
-    elif edited:
-        advice = f"{file} was edited since; mend it, add --change to continue with what it says"
+    fixed = [name for name in refused if name in FIXED]
+    if edited and not change:
+        advice = f"{file} was edited since; mend it{'' if fixed else ', add --change to continue with what it says'}"
+    elif fixed:
+        advice = f"--change cannot change {', '.join(fixed)}; leave them as they are"
     raise UsageError(
         f"the run in {folder} was made with other settings; {advice}, or choose another --out:{listed(refused)}"
     )

@@ -257,6 +257,15 @@ def test_a_pipe_is_written_and_never_replaced(tmp_path: pathlib.Path):
         raise OSError(28, "No space left on device")
 
 
+def test_a_link_behind_o_stays_one(tmp_path: pathlib.Path):
+    out, link = tmp_path / "page" / "x.html", tmp_path / "link.html"
+    link.symlink_to(out)
+    for text in ("first", "second"):
+        with writing(link) as partial:
+            partial.write_text(text)
+        assert link.is_symlink() and out.read_text() == text
+
+
 def test_a_file_behind_o_is_whole_or_the_old_one(tmp_path: pathlib.Path):
     out = tmp_path / "table.md"
     out.write_text("old")

@@ -153,6 +153,7 @@ def test_mistakes_are_one_sentence(
     file.unlink() if content is None else file.write_text(content)
     code, _, err = cli("train", "lane", "--method", f"{file}{name}", *TINY, "--out", tmp_path / "run")
     assert code == 2 and said in err and len(err.splitlines()) == 1, err
+    assert "methods.py, line" not in err
     assert not (tmp_path / "run").exists()
 
 

@@ -39,6 +39,13 @@ def test_a_table_by_hand(tmp_path: pathlib.Path, cli):
     assert data["mappo_l"]["better"] is None
 
 
+def test_cost_beyond_is_of_true_costs_where_few_were_noticed(tmp_path: pathlib.Path, cli):
+    beyond = {"true_episode_cost": 11.0, "episode_cost_beyond": 5.0}
+    made(tmp_path / "a", "lane", "mappo_l", {0: [1, 5.5]}, cost_seen=0.5, **beyond)
+    (data,) = json.loads(cli("table", tmp_path, "--format", "json")[1])["rows"]
+    assert (data["true cost"]["mean"], data["cost beyond"]["mean"]) == (11, 10)
+
+
 def test_a_table_says_how_the_limit_was_kept(tmp_path: pathlib.Path, cli):
     """Shares of episodes at the end; the excess over all of training."""
     lines = [

@@ -101,10 +101,11 @@ def test_an_evaluation_that_fails_costs_nothing_else(copy: pathlib.Path, cli, mo
 # Whether the limit was kept
 
 
-def log_of(costs, multiplier=1.0, deployed=None, limit=1.0, method="mappo_l", **settings) -> run_log.RunLog:
-    """A run of 20 rows: `costs` [S, 20] of the training episodes."""
+def log_of(costs, multiplier=1.0, deployed=None, limit=1.0, method="mappo_l", true=None, **settings) -> run_log.RunLog:
+    """A run of 20 rows: `costs` [S, 20] of the training episodes as they were noticed, and as they were."""
     costs = np.asarray(costs, float)
     names = {"episode_cost": costs, "lambda": np.full_like(costs, multiplier)}
+    names |= {} if true is None else {"true_episode_cost": np.asarray(true, float)}
     evaluation = {} if deployed is None else {"episode_cost": np.asarray(deployed, float)}
     settings = {"lambda_max": 20.0, **settings}
     return run_log.RunLog(
@@ -148,6 +149,11 @@ CASES = {
         log_of([FLAT * np.nan], deployed=[3.0]),
         "limit 1: unknown in",
         "no episode ended; kept by 0 of 1 seed",
+    ),
+    "few are noticed": (
+        log_of([FLAT - 1], true=[np.linspace(50, 12, 20)], cost_seen=0.1),
+        "limit 10 on true costs: kept by 0 of 1 seed",
+        "costs were still falling (17 to 13)",
     ),
     "only with noise": (log_of([FLAT - 1], deployed=[3.0]), "under mean actions, the worst 2 beyond", "with noise"),
 }

@@ -180,6 +180,16 @@ def test_xla_tries_out_no_kernels_on_a_gpu(backend: str, flags: str, options: An
     assert jax.jit(lambda x: x + 1).lower(1).compile(options)(1) == 2  # the name is one that XLA knows
 
 
+def test_a_cache_that_cannot_be_written_is_said_once_and_left_off(monkeypatch, capsys, tmp_path: pathlib.Path):
+    config = SimpleNamespace(jax_compilation_cache_dir=None)
+    monkeypatch.setattr(compile, "jax", SimpleNamespace(config=config))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compile.os, "access", lambda path, mode: False)
+    compile.use_cache()  # which would update the configuration
+    said = capsys.readouterr().err
+    assert said == f"compiled programs are not kept, for {tmp_path / 'pmt-jax'} cannot be written; {compile.ANEW}\n"
+
+
 @pytest.mark.parametrize("chosen", ["", "relative", None])
 def test_a_cache_home_that_does_not_count(chosen: str | None, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(compile, "jax", SimpleNamespace(config=None))
