@@ -261,7 +261,8 @@ def test_reproduce_runs_what_is_missing_and_prints_it(alone: pathlib.Path, tmp_p
 def test_a_point_that_was_begun_with_other_settings_is_named(tmp_path: pathlib.Path):
     begun, wanted = ({"clip=0.1": load_config("lane", clip=0.1, steps=steps)} for steps in (2400, 3600))
     sweep.write_points(sweep.Program(tmp_path / ".group-1", begun, tmp_path))
-    assert list(sweep.grouped(begun, begun, tmp_path)) == [(tmp_path / ".group-1", begun)]
+    ((folder, group),) = sweep.grouped(begun, begun, tmp_path)
+    assert folder == tmp_path / ".group-1" and group.keys() == begun.keys()
     with pytest.raises(UsageError, match=r"has begun 'clip=0.1' with other settings \(steps: 2400 -> 3600\); choose"):
         list(sweep.grouped(wanted, wanted, tmp_path))
 
