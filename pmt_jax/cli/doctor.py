@@ -140,16 +140,16 @@ def check_engines() -> Iterator[Finding]:
 
 def check_cache() -> Finding:
     """What the persistent compile cache holds, and whether one process finds what another has put into one."""
-    from ..training.compile import cache_folder
+    from ..training.compile import ANEW, cache_folder, can_keep
 
     try:
         place = cache_folder()
     except RuntimeError as error:
-        return Finding("no", "compile cache", f"there is no place for it ({error}), so every start compiles anew")
+        return Finding("no", "compile cache", f"there is no place for it ({error}), so {ANEW}")
     programs = list(place.glob("*-cache")) if place.is_dir() else []
     holds = f"{place} holds {len(programs)} programs, {sum(p.stat().st_size for p in programs) / 1e6:.1f} MB"
-    if not os.access(next(p for p in (place, *place.parents) if p.exists()), os.W_OK):
-        return Finding("no", "compile cache", f"{holds}; it cannot be written, so every start compiles anew")
+    if not can_keep(place):
+        return Finding("no", "compile cache", f"{holds}; it cannot be written, so {ANEW}")
     with tempfile.TemporaryDirectory() as folder:
         environment = {"JAX_COMPILATION_CACHE_DIR": folder, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         _, second = (run_python(_CACHE_PROBE, **environment) for _ in range(2))

@@ -191,11 +191,14 @@ def _finished(folder: pathlib.Path, config: Config) -> bool:
         if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
             raise UsageError(f"{folder} holds no run but other files; remove them or choose another --out")
         return False
-    changes = differences(load_config(folder / "config.toml"), config)
-    changed = ", ".join(f"{name}: {change}" for name, change in changes.items())
-    if changed:
+    if changed := _changed(load_config(folder / "config.toml"), config):
         raise UsageError(f"{folder} was made with other settings ({changed}); choose another --out")
     return True
+
+
+def _changed(made: Config, wanted: Config) -> str:
+    """The settings that differ, "clip: 0.1 -> 0.2, ..."."""
+    return ", ".join(f"{name}: {change}" for name, change in differences(made, wanted).items())
 
 
 def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tuple[pathlib.Path, Points]]:
@@ -209,10 +212,9 @@ def grouped(points: Points, missing: Points, out: pathlib.Path) -> Iterator[tupl
     for folder in begun:
         group = program_folder.points(folder)
         for name in group.keys() & left.keys():
-            if changes := differences(group[name], left[name]):
-                listed = ", ".join(f"{setting}: {change}" for setting, change in changes.items())
+            if changed := _changed(group[name], left[name]):
                 raise UsageError(
-                    f"{folder} has begun '{name}' with other settings ({listed}); choose another --out, or delete it"
+                    f"{folder} has begun '{name}' with other settings ({changed}); choose another --out, or delete it"
                 )
         wanted = all(repr(points.get(name)) == repr(config) for name, config in group.items())
         if wanted and any(name in left for name in group):

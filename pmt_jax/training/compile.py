@@ -62,6 +62,11 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(chosen or tasks.native().cache_of_user())
 
 
+def can_keep(folder: pathlib.Path) -> bool:
+    """Whether programs can be written into the folder, which need not be there yet."""
+    return os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK)
+
+
 def use_cache() -> None:
     """Keeps compiled programs in `cache_folder()`; nowhere if the user has no home, or one that cannot be written."""
     if not getattr(jax.config, "jax_compilation_cache_dir", None):
@@ -69,7 +74,7 @@ def use_cache() -> None:
             folder = cache_folder()
         except RuntimeError:
             return
-        if not os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK):
+        if not can_keep(folder):
             to_stderr(f"compiled programs are not kept, for {folder} cannot be written; {ANEW}")
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
