@@ -245,31 +245,6 @@ def shared(run: Run) -> dict[str, str]:
     return {name: repr(x) for name, x in sorted(settings(run).items()) if name not in OF_A_SAMPLE | {"env"}}
 
 
-def as_ran(files: pathlib.Path) -> str:
-    """What has run: a line a file of runs; a + joins the names of several files."""
-    head = (
-        "result",
-        "task",
-        "methods",
-        "seeds x steps",
-        "device",
-        "minutes",
-        "seeds with a multiplier within the limit",
-    )
-    body = []
-    for name in files.stem.split("+"):
-        found = load(files.with_stem(name))
-        held = [run for run in found if has_multiplier(run["method"])]
-        kept = [beyond <= 0 for run in held for beyond in row_of(run).beyond]
-        first, steps = found[0], sorted({max(run["steps"]) for run in found})
-        span = " to ".join(f"{x:,}" for x in dict.fromkeys((steps[0], steps[-1])))
-        line = [f"`{name}`", f"`{first['task']}`", str(len({run["method"] for run in found}))]
-        devices = " and ".join(dict.fromkeys(run["versions"]["device"] for run in found))
-        line += [f"{len(first['seeds'])} x {span}", f"{devices}, `{first['versions']['engine']}`"]
-        body.append([*line, f"{max(run['seconds'] for run in found) / 60:.1f}", f"{sum(kept)} of {len(kept)}"])
-    return markdown(head, body)
-
-
 def _mean_std(*mean_and_std: float | None) -> str:
     """As `mean ± std`; some report no standard deviation. "-" if a seed broke, which has no score."""
     if mean_and_std[0] is None:
@@ -325,26 +300,26 @@ def as_points(file: pathlib.Path) -> str:
 
 
 def as_mean_actions(file: pathlib.Path) -> str:
-    """A line a run: seeds within, mean cost and interquartile mean reward of training episodes and of mean actions.
+    """A line a run: seeds within, mean cost and interquartile mean reward, each of training episodes; of mean actions.
 
-    Costs are the worst agent's where agents differ.
+    Costs are the worst agent's where agents differ. Task and limit have a column if there are several.
     """
     found = sorted(load(file), key=lambda run: (run["task"], run["cost_limit"], place(run["method"])))
-    several = len({run["task"] for run in found}) > 1
+    about = [name for name in ("task", "cost_limit") if len({run[name] for run in found}) > 1]
     body = []
     for run in found:
         label = " ".join(word for word in run["label"].split() if not word.startswith("cost_limit="))
-        line = [*([run["task"]] if several else []), f"{run['cost_limit']:g}", label]
+        line = [*(f"{run[name]:g}" if name == "cost_limit" else run[name] for name in about), label]
         row = row_of(run)
         of_mean, of_mean_reward = (row.scores[f"{OF_MEAN_ACTIONS}{name}"] for name in ("cost", "reward"))
         judged = f"{OF_MEAN_ACTIONS}{BEYOND}"
         beyond = row.scores[judged] if judged in row.scores else of_mean - run["cost_limit"]
-        with_noise = row.beyond, row.score("worst agent"), row.scores["reward"]
-        for excess, cost, reward in (with_noise, (beyond, of_mean, of_mean_reward)):
-            line += [f"{(excess <= 0).sum()} of {excess.size}", f"{cost.mean():.2f}", f"{iqm(reward):,.4g}"]
-        body.append(line)
-    about, measured = ["task", "limit", "method"][not several :], ["seeds within", "cost", "reward"]
-    return markdown((*about, *measured, *(f"mean actions: {name}" for name in measured)), body)
+        within = f"{(row.beyond <= 0).sum()}; {(beyond <= 0).sum()} of {beyond.size}"
+        cost = f"{row.score('worst agent').mean():.2f}; {of_mean.mean():.2f}"
+        reward = f"{iqm(row.scores['reward']):,.4g}; {iqm(of_mean_reward):,.4g}"
+        body.append([*line, within, cost, reward])
+    measured = [f"{name}: noise; mean actions" for name in ("seeds within", "cost", "reward")]
+    return markdown((*(name.removeprefix("cost_") for name in about), "method", *measured), body)
 
 
 KINDS: dict[str, Callable[[pathlib.Path], str]] = {
@@ -355,5 +330,4 @@ KINDS: dict[str, Callable[[pathlib.Path], str]] = {
     "summary": as_summary,
     "overview": as_overview,
     "printed": as_printed,
-    "ran": as_ran,
 }

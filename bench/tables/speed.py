@@ -393,7 +393,7 @@ TABLES: dict[str, Callable[[Reports], str]] = {
     "methods": Table(
         "methods",
         ("training",),
-        ("task", "method", "compile, s", "update x MAPPO-L", "environment steps/s"),
+        ("method", "compile, s", "update x MAPPO-L", "environment steps/s"),
     ),
     "power_flows": Table(
         "grid", ("power flow",), ("task", "batch", "what", "power flows/s", "ours f32 is faster by (lowest)")

@@ -103,7 +103,7 @@ def as_probe(files: pathlib.Path) -> str:
 
 
 def as_harm(files: pathlib.Path) -> str:
-    """The harm of `as_probe` alone, for the README."""
+    """The harm of `as_probe` alone, for the README. Seeds beyond are MAPPO-L's, then F4SG's."""
     found = pairs(files)
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
@@ -112,9 +112,11 @@ def as_harm(files: pathlib.Path) -> str:
     for pair, (theirs, ours), corrected in zip(found, scores, p, strict=True):
         task = f"`{pair[0]['task']}`" + f", limit {_limit(pair[0]):g}" * (often[pair[0]["task"], share(pair[0])] > 1)
         line = [task, f"{share(pair[0]):g}", mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
-        body.append([*line, p_value(corrected), *map(unsafe, pair)])
-    head = ["task", "p", "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p"]
-    return markdown([*head, "seeds beyond: MAPPO-L", "F4SG"], body)
+        body.append([*line, p_value(corrected), ", ".join(map(unsafe, pair))])
+    head = ["task", "p", "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p", "seeds beyond"]
+    if len({line[1] for line in body}) == 1:  # all have one probability
+        head, body = [head[0], *head[2:]], [[line[0], *line[2:]] for line in body]
+    return markdown(head, body)
 
 
 def as_controls(files: pathlib.Path) -> str:
