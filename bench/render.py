@@ -1,12 +1,12 @@
 """Tables in the documentation, made from bench/results.
 
 A block of a Markdown file, from the line `<!-- bench: NAME -->` to the line `<!-- /bench -->`, holds what NAME in
-bench/tables/speed.py makes of the results; whatever stood there before is replaced. The name `curves:FILE` means the
-table, as `pmt table` makes it, of the runs stored in bench/results/FILE.json, `points:FILE` for a line a run,
-`paper:FILE` for means and standard deviations next to the paper's, `summary:FILE+FILE` for methods by tasks,
-`overview:FILE+FILE` for tasks by methods with PID, `pairs:FILE` for a test of each pair of methods. Tables of seldom
-noticed costs are in study.py; those of tasks, settings and methods, as `observation:ant_2x4`, in pages.py. In a
-sentence, `<!-- bench: within:FILE:METHOD:LIMIT -->18<!-- /bench -->` is a number, see values.py.
+bench/tables/speed.py makes of the results; whatever stood there before is replaced. The name `paper:FILE` means a
+table of the runs stored in bench/results/FILE.json: means and standard deviations next to the paper's;
+`mean_actions:FILE` has both measures of a limit, `summary:FILE+FILE` methods by tasks, `overview:FILE+FILE` tasks by
+methods with PID. Tables of seldom noticed costs are in study.py; those of tasks, settings and methods, as
+`observation:ant_2x4`, in pages.py. In a sentence, `<!-- bench: within:FILE:METHOD:LIMIT -->18<!-- /bench -->` is a
+number, see values.py.
 """
 
 from __future__ import annotations

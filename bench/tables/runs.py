@@ -19,7 +19,7 @@ from pmt_jax.limits import Limits
 from pmt_jax.studies import plot, program_folder, table
 from pmt_jax.studies.rows import TableRow, in_order, place, rows
 from pmt_jax.studies.run_log import RunLog, groups, read_all
-from pmt_jax.studies.statistics import iqm, mean_interval
+from pmt_jax.studies.statistics import iqm
 from pmt_jax.tasks import columns
 
 from .. import records
@@ -32,7 +32,6 @@ TRUE_CURVES = ("true_episode_cost", "true_step_cost")  # runs of before cost_see
 DIAGNOSTICS = ("fear/", "regret/", "actor/case", "actor/entropy", "actor/std", "cost_critic/explained_variance")
 # Settings in which runs of one sample may differ: they change no number of the learner, or only the seeds.
 OF_A_SAMPLE = {"seed", "seeds", "steps", "physics", "log_interval", "eval_interval", "eval_episodes"}
-WHILE_TRAINING = "cost while training"
 OF_MEAN_ACTIONS = "of mean actions: "  # in the last evaluation
 TRUE = "true cost"  # also of steps that the learner did not observe
 TRUE_WHILE_TRAINING = "true cost per 1,000 steps while training"
@@ -78,11 +77,11 @@ def _compact(log: RunLog, points: int) -> Run:
     """A run's curves per seed, its figures in a table, and what it takes to make it again.
 
     Curves are {name: [seeds][points]}, None where unknown; `diagnostics` are means over seeds [points], also of what
-    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and the mean of the cost over all rows,
-    which count alike, and what the last evaluation found, the one that ended the run if there was one.
+    the task reports; `table` is {column: [seeds]}, see `pmt_jax.studies.table`, and what the last evaluation found, the
+    one that ended the run if there was one.
     """
     found, (row,) = log.thinned(points), rows([log])
-    scores = row.scores | {WHILE_TRAINING: np.nanmean(log.metrics["episode_cost"], axis=1)}
+    scores = dict(row.scores)
     if "true_step_cost" in log.metrics:
         scores |= {TRUE_WHILE_TRAINING: 1000 * np.nanmean(log.metrics["true_step_cost"], axis=1)}
     evaluated = np.isfinite(log.metrics.get("eval/episode_cost", np.empty((0, 0)))).any(0)
@@ -130,11 +129,6 @@ def curves(run: Run) -> RunLog:
         steps=np.array(run["steps"]),
         metrics=known | {name: np.tile(mean, (len(run["seeds"]), 1)) for name, mean in means.items()},
     )
-
-
-def as_pmt_table(file: pathlib.Path) -> str:
-    """The table that `pmt table` makes of the runs, without the sentences below it that say what its figures mean."""
-    return table.render(in_order([row_of(run) for run in load(file)]), "markdown").split("\n\n")[0]
 
 
 def as_paper(file: pathlib.Path) -> str:
@@ -280,25 +274,6 @@ def _scores(run: Run) -> dict[str, np.ndarray]:
     return {column: np.array(seeds, float) for column, seeds in run["table"].items()}
 
 
-def as_points(file: pathlib.Path) -> str:
-    """A line a run: what sets it apart, then means over seeds with 95 % intervals; in the order of METHODS.
-
-    True costs have a column if a run did not notice all of them.
-    """
-    found = load(file)
-    hidden = any(run["table"].get(TRUE, run["table"]["cost"]) != run["table"]["cost"] for run in found)
-    columns = ("cost", *([TRUE] if hidden else ()), WHILE_TRAINING, "reward")
-    found.sort(key=lambda run: (run["task"], place(run["method"])))
-    present = [column for column in columns if all(column in run["table"] for run in found)]
-
-    def cell(values: np.ndarray) -> str:
-        low, high = mean_interval(values)
-        return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(values).all() else "-"
-
-    body = [[run["task"], run.get("label", run["method"]), *(cell(_scores(run)[c]) for c in present)] for run in found]
-    return markdown(("task", "method", *present), body)
-
-
 def as_mean_actions(file: pathlib.Path) -> str:
     """A line a run: seeds within, mean cost and interquartile mean reward, each of training episodes; of mean actions.
 
@@ -323,8 +298,6 @@ def as_mean_actions(file: pathlib.Path) -> str:
 
 
 KINDS: dict[str, Callable[[pathlib.Path], str]] = {
-    "curves": as_pmt_table,
-    "points": as_points,
     "mean_actions": as_mean_actions,
     "paper": as_paper,
     "summary": as_summary,

@@ -34,9 +34,7 @@ from pmt_jax.errors import UsageError
 from pmt_jax.learning import fear, learner
 from pmt_jax.learning.maths import advantages
 from pmt_jax.policies import hub
-from pmt_jax.studies import points, table
-from pmt_jax.studies.rows import rows
-from pmt_jax.studies.run_log import read_all
+from pmt_jax.studies import points
 from pmt_jax.training import final
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -435,11 +433,11 @@ def fake_run(folder: pathlib.Path, **settings: Any) -> pathlib.Path:
 
 
 def test_a_block_of_stored_runs_is_their_table(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
-    run = fake_run(tmp_path / "runs" / "x")
+    fake_run(tmp_path / "runs" / "x")
     assert main(["store", str(tmp_path / "runs"), "-o", str(tmp_path / "one.json")]) == 0
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    block = "<!-- bench: curves:{} -->\n{}<!-- /bench -->\n"
-    of_runs = table.render(rows(read_all([run])), "markdown").split("\n\n")[0]
+    block = "<!-- bench: paper:{} -->\n{}<!-- /bench -->\n"
+    of_runs = runs.as_paper(tmp_path / "one.json")
     assert render.render(block.format("one", "old\n"), {}) == block.format("one", of_runs + "\n")
     (tmp_path / "bad.json").write_text("[{}]")
     for name in ("bad", "none"):
@@ -467,25 +465,11 @@ def test_curves_are_stored_with_as_many_points_as_asked_and_tables_come_from_all
     assert two["table"] == every["table"]
 
 
-def test_points_say_what_sets_them_apart(tmp_path: pathlib.Path):
+def test_labels_say_what_sets_runs_apart(tmp_path: pathlib.Path):
     for clip in (0.1, 0.2):
         fake_run(tmp_path / "runs" / f"clip={clip}", clip=clip)
     runs.store([tmp_path / "runs"], tmp_path / "points.json")
-    lines = runs.as_points(tmp_path / "points.json").splitlines()
-    assert lines[0] == "| task | method | cost | cost while training | reward |"
-    assert [line.split(" | ")[1] for line in lines[2:]] == ["happo clip=0.1", "happo clip=0.2"]
-    assert " | 100.6" in lines[2]  # the mean of all episodes of both seeds: 2 / 3 (150.5 + 0.5)
-
-
-def test_points_have_true_costs_if_some_were_not_noticed(tmp_path: pathlib.Path):
-    run = next(x for x in stored()["fear_multiplier"] if x["method"] == "f4sg")
-    noticed, file = run | {"table": run["table"] | {"true cost": run["table"]["cost"]}}, tmp_path / "x.json"
-    for found, columns in (
-        ([noticed], "cost | cost while training"),
-        ([noticed, run], "cost | true cost | cost while"),
-    ):
-        file.write_text(json.dumps(found))
-        assert columns in runs.as_points(file).splitlines()[0]
+    assert [run["label"] for run in runs.load(tmp_path / "points.json")] == ["happo clip=0.1", "happo clip=0.2"]
 
 
 def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
@@ -545,7 +529,7 @@ def test_a_method_of_a_file_has_a_line_in_every_table(tmp_path: pathlib.Path):
     }
     run["table"] |= {f"of mean actions: {name}": [1.0, 2.0] for name in ("cost", "reward")}
     (tmp_path / "x.json").write_text(json.dumps([run]))
-    for kind in (runs.as_points, runs.as_mean_actions, runs.as_overview, runs.as_summary, runs.as_paper):
+    for kind in (runs.as_mean_actions, runs.as_overview, runs.as_summary, runs.as_paper):
         assert "1 of 1" not in kind(tmp_path / "x.json") and len(kind(tmp_path / "x.json").splitlines()) == 3
 
 
@@ -566,7 +550,6 @@ def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
     file.write_text(json.dumps(found))
     assert runs.as_paper(file).splitlines()[-1] == "| mixed pid | - | - | 4 of 5 | - | - | - |"
     assert "- / -, 4 of 5" in runs.as_summary(file)
-    assert any("| mixed" in line and "| - | - | - |" in line for line in runs.as_points(file).splitlines())
 
 
 def test_only_a_multiplier_is_called_pid(tmp_path: pathlib.Path):

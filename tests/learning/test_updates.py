@@ -445,6 +445,24 @@ def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float
     assert cost <= most_cost and reward >= least_reward
 
 
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("task", "method", "most_cost", "least_reward"),
+    [
+        ("lane", "mappo_l", 1.3, 18.3),  # cost 0.78 +- 0.11, reward 18.51 +- 0.01
+        ("noisy", "mappo_l", 0.6, 18.1),  # cost 0.38 +- 0.05, reward 18.44 +- 0.02
+        ("lane", "macpo", 1.3, 18.3),  # cost 0.96 +- 0.04, reward 18.49 +- 0.02
+    ],
+)
+def test_a_run_of_four_times_the_steps_keeps_what_it_has_learned(
+    task: str, method: str, most_cost: float, least_reward: float
+):
+    """The defaults, whole; the figures are of 5 seeds. With steps that nothing bounds such runs ended at a cost of 24."""
+    _, metrics = jax.jit(make_train(load_config(task, method=method, steps=500_000)))(jax.random.key(1))
+    cost, reward = (np.asarray(metrics[name])[-40:].mean() for name in ("episode_cost", "episode_reward"))
+    assert cost <= most_cost and reward >= least_reward
+
+
 def test_an_evaluation_of_nothing_and_of_several_seeds_is_refused():
     setup = make_setup(load_config("lane", num_envs=4, hidden=[8]))
     states = jax.vmap(functools.partial(learner.init, setup, setup.hyper))(jax.random.split(jax.random.key(0), 2))
