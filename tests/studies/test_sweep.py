@@ -179,7 +179,7 @@ def test_killed_while_the_points_are_written(swept: pathlib.Path, tmp_path: path
 def test_points_of_one_program_keep_to_their_own_limits(tmp_path: pathlib.Path, cli):
     """What a row says, what the multiplier answers to, and which policy is the best so far."""
     small = ("--num-envs", 8, "--rollout-length", 25, "--log-interval", 2, "--hidden", 8, "--steps", 4000)
-    limits = ("--set", "cost_limit=0.2,50", "--lambda-lr", 1)
+    limits = ("--set", "cost_limit=0.2,50", "--lambda-lr", 1, "--lambda-kp", 0.5, "--kl-max", "inf")
     assert cli("sweep", "lane", *small, *limits, "--method", "mappo_l", "--no-cache", "--out", tmp_path)[0] == 0
     strict, loose = (tmp_path / f"cost_limit={limit}" for limit in ("0.2", "50"))
     assert {row["cost_limit"] for row in rows(strict)} == {0.2} and {row["cost_limit"] for row in rows(loose)} == {50}
