@@ -457,7 +457,7 @@ def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float
 def test_a_run_of_four_times_the_steps_keeps_what_it_has_learned(
     task: str, method: str, most_cost: float, least_reward: float
 ):
-    """The defaults, whole; the figures are of 5 seeds. With steps that nothing bounds such runs ended at a cost of 24."""
+    """The defaults; the figures are of 5 seeds. With steps that nothing bounds such runs ended at a cost of 24."""
     _, metrics = jax.jit(make_train(load_config(task, method=method, steps=500_000)))(jax.random.key(1))
     cost, reward = (np.asarray(metrics[name])[-40:].mean() for name in ("episode_cost", "episode_reward"))
     assert cost <= most_cost and reward >= least_reward
