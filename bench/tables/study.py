@@ -103,19 +103,18 @@ def as_probe(files: pathlib.Path) -> str:
 
 
 def as_harm(files: pathlib.Path) -> str:
-    """The harm of `as_probe` alone, for the README. Seeds beyond are MAPPO-L's, then F4SG's."""
+    """The harm of `as_probe` alone, with p if there are several. Seeds beyond are MAPPO-L's, then F4SG's."""
     found = pairs(files)
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
     often = collections.Counter((pair[0]["task"], share(pair[0])) for pair in found)
+    several = len({share(pair[0]) for pair in found}) > 1
     body = []
     for pair, (theirs, ours), corrected in zip(found, scores, p, strict=True):
         task = f"`{pair[0]['task']}`" + f", limit {_limit(pair[0]):g}" * (often[pair[0]["task"], share(pair[0])] > 1)
-        line = [task, f"{share(pair[0]):g}", mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
+        line = [task, *[f"{share(pair[0]):g}"] * several, mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
         body.append([*line, p_value(corrected), ", ".join(map(unsafe, pair))])
-    head = ["task", "p", "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p", "seeds beyond"]
-    if len({line[1] for line in body}) == 1:  # all have one probability
-        head, body = [head[0], *head[2:]], [[line[0], *line[2:]] for line in body]
+    head = ["task", *["p"] * several, "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p", "seeds beyond"]
     return markdown(head, body)
 
 
