@@ -407,7 +407,7 @@ def test_presets_for_comparison_run(method: str, preset: str):
 # deviations away from the mean.
 
 
-def learned(task: str, method: str, steps: int = 30_000, **changes: str) -> tuple[float, float]:
+def learned(task: str, method: str, steps: int = 30_000, **changes: float | str) -> tuple[float, float]:
     """Mean episode cost and reward of the last 15 updates."""
     config = load_config(task, method=method, num_envs=16, hidden=(16,), steps=steps, **changes)
     _, metrics = jax.jit(make_train(config))(jax.random.key(1))
@@ -432,7 +432,7 @@ def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
     ("method", "most_cost", "least_reward"),
     [
         ("mappo_l", 1.4, 15.9),  # cost 0.95 +- 0.07, reward 16.40 +- 0.16
-        pytest.param("macpo", 1.2, 14.9, marks=pytest.mark.full),  # cost 0.90 +- 0.09, reward 15.29 +- 0.12
+        pytest.param("macpo", 0.95, 16.4, marks=pytest.mark.full),  # cost 0.84 +- 0.04, reward 16.71 +- 0.09
         pytest.param("ippo_l", 1.5, 15.4, marks=pytest.mark.slow),  # cost 0.98 +- 0.11, reward 16.31 +- 0.28
         pytest.param("mappo_pid", 1.3, 15.7, marks=pytest.mark.slow),  # cost 0.90 +- 0.06, reward 16.17 +- 0.13
         pytest.param("crpo", 1.3, 15.3, marks=pytest.mark.full),  # cost 0.97 +- 0.08, reward 15.70 +- 0.10
@@ -441,7 +441,7 @@ def test_unsafe_methods_learn_the_reward_and_pay(task: str, method: str):
 )
 def test_safe_methods_learn_near_the_limit_of_lane(method: str, most_cost: float, least_reward: float):
     """Its limit is 1, where 18.85 can be earned; costs are held to 0.8. The figures are of 8 seeds."""
-    cost, reward = learned("lane", method)
+    cost, reward = learned("lane", method, lr_end=1.0)  # so short a run has no time for the trust region to shrink
     assert cost <= most_cost and reward >= least_reward
 
 
