@@ -33,20 +33,19 @@ class Plan(NamedTuple):
 
 
 def plan(robots: int, hazards: int, vases: int, reference: bool) -> Plan:
-    """The first robot, the goals, hazards, vases, then the other robots.
+    """Robots first, which need most room, then goals, hazards and vases.
 
-    In the reference the other robot's keepout to others is not its own but that of the thing placed before it.
+    In the reference the other robot comes last, with the keepout of the thing placed before it in place of its own.
     """
     keepouts = np.array([AGENT] * robots + [GOAL] * robots + [HAZARD] * hazards + [VASE] * vases)
     count = len(keepouts)
-    order = np.array([0, *range(robots, count), *range(1, robots)])
+    order = np.array([0, *range(robots, count), *range(1, robots)]) if reference else np.arange(count)
     keepout = keepouts[order]
     gap = keepout[:, None] + keepout[None]
-    last = np.arange(count) >= count - (robots - 1)
-    if reference:
-        gap[last] = keepout[~last][-1] + keepout
+    last = reference & (np.arange(count) >= count - (robots - 1))
+    gap[last] = keepout[~last][-1] + keepout
     gap = np.where(np.tri(count, k=-1, dtype=bool), gap, -np.inf)
-    return Plan(keepout, gap, last & reference, order)
+    return Plan(keepout, gap, last, order)
 
 
 def place_one(

@@ -264,7 +264,7 @@ def test_vases_within_a_robots_reach_need_a_slot():
 
 
 def test_what_found_no_room_is_counted_after_restore_too():
-    env = envs.make("multi_goal_point_0", wiring="own", physics="mujoco")
+    env = envs.make("multi_goal_point_0", wiring="own", size=0.8, physics="mujoco")
     resets = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 8))
     restored = jax.vmap(lambda state: env.restore(**env.raw(state)))(resets)
     assert resets.carry.crowded.any()
