@@ -240,11 +240,11 @@ def shared(run: Run) -> dict[str, str]:
 
 
 def _mean_std(*mean_and_std: float | None) -> str:
-    """As `mean ± std`; some report no standard deviation. "-" if a seed broke, which has no score."""
+    """As `mean±std`; some report no standard deviation. "-" if a seed broke, which has no score."""
     if mean_and_std[0] is None:
         return "-"
     digits = 2 if abs(mean_and_std[0]) >= 1 else 4
-    return " ± ".join(f"{x:,.{digits}f}" for x in mean_and_std)
+    return "±".join(f"{x:,.{digits}f}" for x in mean_and_std)
 
 
 def has_pid(method: str, settings: Mapping[str, Any]) -> bool:

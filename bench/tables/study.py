@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import pathlib
 from collections.abc import Callable, Iterable
 
@@ -19,6 +18,7 @@ Scores = NDArray[np.float64]  # [seeds]
 
 NAMES = {"mappo_l": "MAPPO-L", "f4sg": "F4SG", "r4sg": "R4SG", "mixed": "Mixed", "macpo": "MACPO"}
 PAIR = ("mappo_l", "f4sg")
+MOST = 0.8  # of the way to the last reward
 EQUAL = {"reward": 2, "training": 10}  # bounds of equivalence, %
 CONTROLS = {  # labels of stored runs, in the order of the table
     "mappo_l": "MAPPO-L",
@@ -56,6 +56,23 @@ def joined(found: Iterable[runs.Run]) -> list[runs.Run]:
     return list(alike.values())
 
 
+def early(run: runs.Run) -> Scores:
+    """True cost per 1,000 steps [seeds] until a point of the reward's curve is `MOST` of the way to the last reward.
+
+    The way is from the first point's reward to the mean of the points in the last tenth of the steps.
+    """
+    steps = np.array(run["steps"])
+    weights = np.diff(steps, prepend=0)
+    rewards, costs = (np.array(run[name], float) for name in ("episode_reward", "true_step_cost"))
+    harm = []
+    for reward, cost in zip(rewards, costs, strict=True):
+        first, last = reward[np.isfinite(reward)][0], np.nanmean(reward[steps > 0.9 * steps[-1]])
+        way = (reward - first) * np.sign(last - first)
+        end = 1 + np.flatnonzero(way >= MOST * abs(last - first))[0]
+        harm.append(1000 * np.nansum((cost * weights)[:end]) / steps[end - 1])
+    return np.array(harm)
+
+
 def share(run: runs.Run) -> float:
     """The probability with which a costly step is noticed."""
     return runs.settings(run)["cost_seen"]
@@ -70,34 +87,38 @@ def unsafe(run: runs.Run) -> str:
 def pairs(files: pathlib.Path, pair: tuple[str, str] = PAIR) -> list[tuple[runs.Run, runs.Run]]:
     """MAPPO-L and F4SG, or another pair of methods, wherever all else is equal.
 
-    They come by probability, then in the order of the files, whose names a + joins.
+    They come by probability, then by task in the order of the files, whose names a + joins.
     """
     cells: dict[str, dict[str, runs.Run]] = {}
     for run in joined(runs.load(files)):
         if run["method"] in pair:
             cells.setdefault(_cell(run), {})[run["method"]] = run
     found = [(cell[pair[0]], cell[pair[1]]) for cell in cells.values() if len(cell) == len(pair)]
-    return sorted(found, key=lambda pair: share(pair[0]))
+    tasks = [theirs["task"] for theirs, _ in found]
+    return sorted(found, key=lambda pair: (share(pair[0]), tasks.index(pair[0]["task"])))
 
 
 def as_probe(files: pathlib.Path) -> str:
     """F4SG against MAPPO-L, a line a comparison; a + joins the names of files.
 
     The tests are Welch's. Holm corrects those of the harm over all lines, the other two with the harm's over the three
-    of their line. d is Cohen's.
+    of their line. d is Cohen's. The harm stands there twice: of the whole run, and until `MOST` of the way to its last
+    reward.
     """
     found = pairs(files)
     scores = [(measures(theirs), measures(ours)) for theirs, ours in found]
     tests = [[welch_test(ours[name], theirs[name]) for name in ours] for theirs, ours in scores]
-    harm = holm([line[0] for line in tests])
+    harm, named = holm([line[0] for line in tests]), line_names(found)
     body = []
     for i, (theirs, ours) in enumerate(scores):
         run, p = found[i][0], map(p_value, (harm[i], *holm(tests[i])[1:]))
-        line = [f"`{run['task']}`", f"{share(run):g}", f"{_limit(run):g}", mean_sd(theirs["training"])]
+        line = [named[i], f"{share(run):g}", f"{_limit(run):g}", mean_sd(theirs["training"])]
         line += [mean_sd(ours["training"]), _effect(ours["training"], theirs["training"])]
+        line += [", ".join(mean_sd(early(run)) for run in found[i])]
         line += [f"{mean_sd(theirs[name])}, {mean_sd(ours[name])}" for name in ("end", "reward")]
         body.append([*line, ", ".join(map(unsafe, found[i])), ", ".join(p)])
     head = ["task", "p", "limit", "harm, of 1,000 steps: MAPPO-L", "F4SG", "difference [95 %], d, %"]
+    head += [f"harm until {MOST:.0%}: MAPPO-L, F4SG".replace("%", " %")]
     head += [f"{what}: MAPPO-L, F4SG" for what in ("true cost at the end", "reward", "seeds beyond")]
     return markdown([*head, "corrected p: harm, cost, reward"], body)
 
@@ -107,12 +128,10 @@ def as_harm(files: pathlib.Path) -> str:
     found = pairs(files)
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
-    often = collections.Counter((pair[0]["task"], share(pair[0])) for pair in found)
     several = len({share(pair[0]) for pair in found}) > 1
     body = []
-    for pair, (theirs, ours), corrected in zip(found, scores, p, strict=True):
-        task = f"`{pair[0]['task']}`" + f", limit {_limit(pair[0]):g}" * (often[pair[0]["task"], share(pair[0])] > 1)
-        line = [task, *[f"{share(pair[0]):g}"] * several, mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
+    for name, pair, (theirs, ours), corrected in zip(line_names(found), found, scores, p, strict=True):
+        line = [name, *[f"{share(pair[0]):g}"] * several, mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
         body.append([*line, p_value(corrected), ", ".join(map(unsafe, pair))])
     head = ["task", *["p"] * several, "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p", "seeds beyond"]
     return markdown(head, body)
@@ -193,6 +212,18 @@ def _cell(run: runs.Run) -> str:
     return repr((_limit(run), {name: x for name, x in runs.shared(run).items() if name != "method"}))
 
 
+def line_names(found: list[tuple[runs.Run, runs.Run]]) -> list[str]:
+    """The task of each comparison, with its limit and multiplier where lines of one probability differ in it."""
+    tasks = [(theirs["task"], share(theirs)) for theirs, _ in found]
+    told = [(f"limit {_limit(x):g}", f"`lambda_lr` {runs.settings(x).get('lambda_lr', 0):g}") for x, _ in found]
+    names = []
+    for task, words in zip(tasks, told, strict=True):
+        alike = [other for of, other in zip(tasks, told, strict=True) if of == task]
+        differ = (word for word, of_all in zip(words, zip(*alike, strict=True), strict=True) if len(set(of_all)) > 1)
+        names.append(", ".join([f"`{task[0]}`", *differ]))
+    return names
+
+
 def _effect(ours: Scores, theirs: Scores) -> str:
     """As `_difference`, and as a share of theirs."""
     return f"{_difference(ours, theirs)}, {_change(ours, theirs)}"
@@ -237,7 +268,7 @@ def as_weights(file: pathlib.Path) -> str:
 def mean_sd(x: Scores) -> str:
     small = abs(x.mean()) < 10 and x.std(ddof=1) < 0.5
     spec = ".0f" if abs(x.mean()) >= 100 else ".2f" if small else ".1f"
-    return f"{x.mean():{spec}} +- {x.std(ddof=1):{spec}}"
+    return f"{x.mean():{spec}}±{x.std(ddof=1):{spec}}"
 
 
 def p_value(value: float) -> str:

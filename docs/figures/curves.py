@@ -27,7 +27,7 @@ FIGURES = {  # the picture's result, and which of its tasks
     "table1_ant_2x4": ("table1_ant_2x4_h200", "ant_2x4"),
     "table2": ("table2_h200", "hand_over_2x6"),
     "table3_voltage_33": ("table3_voltage_33", "voltage_33"),
-    "velocity_half_cheetah_2x3": ("velocity_h200", "velocity_half_cheetah_2x3"),
+    "velocity_half_cheetah_2x3": ("velocity_recipe_h200", "velocity_half_cheetah_2x3"),
     "grid_33": ("table3_voltage_33", "voltage_33"),
     "harm": ("fear_h200", "ant_2x4"),
 }

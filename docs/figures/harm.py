@@ -17,7 +17,7 @@ from pmt_jax.studies.plot import METHOD_COLOURS
 from . import style
 
 FILE = pathlib.Path(__file__).parents[1] / "harm_by_task.png"
-RESULT = records.RESULTS / "fear_h200+fear_voltage_33.json"
+RESULT = records.RESULTS / "fear_h200+fear_multiplier+fear_voltage_33.json"
 APART = 0.17  # of the two methods' rows from the middle of a task's
 
 
@@ -30,7 +30,8 @@ def draw() -> None:
         for row, pair in enumerate(found):
             for run, above in zip(pair, (APART, -APART), strict=True):
                 _seeds(axis, run, row + above, named=row == 0)
-        axis.set_yticks(range(len(found)), [pair[0]["task"].removeprefix("velocity_") for pair in found])
+        names = [name.replace("`", "").removeprefix("velocity_") for name in study.line_names(found)]
+        axis.set_yticks(range(len(found)), names)
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter(ScalarFormatter())
         axis.set_xlabel("costly steps of 1,000 while training, noticed or not")

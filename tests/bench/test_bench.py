@@ -345,16 +345,16 @@ def test_rendering_replaces_blocks_and_nothing_else():
 
 
 def test_rendering_fills_numbers_in_sentences():
-    mark = "within:laptop_ant_2x4:f4sg:{}"
+    mark = "within:laptop:f4sg:{}"
     text = f"kept by <!-- bench: {mark.format('1:ant_2x4')} -->9<!-- /bench --> of 10"
     assert "-->3<!-- /bench --> of 10" in render.render(text, {})
-    assert values.number(mark.format("*")) == "20"
-    assert values.number(mark.format("1").replace("within", "seeds")) == "10"
+    assert values.number(mark.format("*:ant_2x4")) == "20"
+    assert values.number(mark.format("1:ant_2x4").replace("within", "seeds")) == "10"
     both = "within:table1_ant_2x4_h200+recipe_ant_4x2_h200:f4sg+mappo_l:*"
     assert values.number(both) == "80" and values.number(both.replace("within", "reward")).replace(",", "").isdigit()
-    assert values.number("seeds:velocity_h200:macpo:25:velocity_walker2d_2x3") == "5"  # of one task in a file of eight
+    assert values.number("seeds:velocity_h200:happo:25:velocity_humanoid_9_8") == "5"  # of one task in a file of eight
     for wrong, said in (
-        (mark.format("7"), "no run of laptop_ant_2x4 is 'f4sg:7'"),
+        (mark.format("7"), "no run of laptop is 'f4sg:7'"),
         ("withn:x:*:1", "unknown value 'withn'; did you mean 'within'?"),
         ("within:x:*:1", "holds no stored runs"),
         ("within:x", "expected within:FILE:METHOD:LIMIT"),
@@ -495,11 +495,11 @@ def test_mean_actions_are_those_of_the_last_evaluation(tmp_path: pathlib.Path):
 
 
 def test_seeds_within_are_judged_by_the_worst_agent(tmp_path: pathlib.Path):
-    (run,) = [x for x in stored()["goals_point_1_h200"] if x["method"] == "mappo_l"]
+    (run,) = [x for x in stored()["goals_point_1_h200"] if x["method"] == "f4sg"]
     (tmp_path / "run.json").write_text(json.dumps([run]))
     line = runs.as_mean_actions(tmp_path / "run.json").splitlines()[2]
     assert max(run["table"]["cost"]) <= run["cost_limit"] < max(run["table"]["worst agent"])
-    assert "| 14; 10 of 20 |" in line
+    assert "| 9; 8 of 10 |" in line
 
 
 def test_seeds_within_are_judged_by_true_costs_where_few_were_noticed(tmp_path: pathlib.Path):
@@ -543,7 +543,7 @@ def test_files_that_cannot_be_compared_are_one_sentence(text: str, says: str, tm
 
 
 def test_a_seed_that_broke_has_no_score(tmp_path: pathlib.Path):
-    found = [run for run in stored()["velocity_h200"] if run["task"] == "velocity_ant_2x4"]
+    found = [run for run in stored()["recipe_ant_4x2_h200"] if len(run["seeds"]) == 5]
     one = next(run for run in found if run["method"] == "mixed")
     one["table"] = {column: [None, *scores[1:]] for column, scores in one["table"].items()}
     file = tmp_path / "broken.json"
@@ -706,6 +706,7 @@ def test_a_probe_compares_fear_where_all_else_is_equal(tmp_path: pathlib.Path):
     table = study.as_probe(tmp_path / "x+y.json")
     rows = [[x.strip() for x in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
     assert [row[:3] for row in rows] == [["`lane`", "0.5", "5"], ["`lane`", "1", "5"]]
+    assert [row[6] for row in rows] == ["85.0±3.3, 15.0±3.3", "15.0±3.3, 15.0±3.3"]  # nothing rises
     assert [row[-2] for row in rows] == ["12 of 12, 0 of 12", "0 of 12, 0 of 12"]
     assert [row[-1] for row in rows] == ["< .001, < .001, 1", "1, 1, 1"]
     assert rows[0][5].startswith("-70.0 [") and rows[1][5].startswith("0.0 [")
@@ -739,6 +740,25 @@ def test_the_harm_is_corrected_over_all_lines(tmp_path: pathlib.Path):
     assert [line.split("|")[-2].split(",")[0].strip() for line in lines] == expected != [study.p_value(x) for x in p]
 
 
+def test_early_harm_ends_with_the_first_point_near_the_last_reward():
+    """A reward that rises to 9 reaches four fifths of its way at the ninth point of ten; one that falls, too."""
+    run = run_of_three_seeds("f4sg", 0.5, [0.0, 0.0])
+    run["episode_reward"] = [[float(x) for x in range(10)], [None, *(-float(x) for x in range(9))]]
+    run["true_step_cost"] = [[0.9] + [0.0] * 9, [*[0.0] * 9, 1.0]]
+    assert study.early(run) == pytest.approx([100.0, 0.0])
+
+
+def test_lines_of_one_task_are_named_by_what_they_differ_in():
+    def pair(limit: float = 5.0, **settings: float) -> tuple[dict, dict]:
+        runs_of_pair = [run_of_three_seeds(method, 0.5, [1.0], **settings) for method in study.PAIR]
+        return tuple(run | {"cost_limit": limit / 2} for run in runs_of_pair)  # type: ignore[return-value]
+
+    slow, fast = pair(lambda_lr=1.0), pair(lambda_lr=10.0)
+    assert study.line_names([slow]) == ["`lane`"]
+    assert study.line_names([slow, fast]) == ["`lane`, `lambda_lr` 1", "`lane`, `lambda_lr` 10"]
+    assert study.line_names([slow, pair(3.0, lambda_lr=1.0)]) == ["`lane`, limit 5", "`lane`, limit 3"]
+
+
 def test_the_worst_agent_is_judged_where_agents_differ():
     run = run_of_three_seeds("f4sg", 1.0, [1.0, 2.0])
     run["table"]["true worst agent"] = [4.0, 6.0]
@@ -749,7 +769,7 @@ def test_the_readmes_harm_is_that_of_the_study(tmp_path: pathlib.Path):
     cells = [(method, cost) for method, cost in (("mappo_l", [8.0, 9.0]), ("f4sg", [2.0, 3.0]))]
     (tmp_path / "x.json").write_text(json.dumps([run_of_three_seeds(method, 0.5, cost) for method, cost in cells]))
     long, short = (kind(tmp_path / "x.json").splitlines()[2] for kind in (study.as_probe, study.as_harm))
-    for cell in ("85.0 +- 7.1", "25.0 +- 7.1", "-71 %"):
+    for cell in ("85.0±7.1", "25.0±7.1", "-71 %"):
         assert cell in long and cell in short
     assert short.endswith("| 2 of 2, 0 of 2 |")
 
@@ -766,7 +786,7 @@ def test_controls_are_compared_where_all_have_run(tmp_path: pathlib.Path):
     elsewhere, noticed = run_of_three_seeds("f4sg", 0.5, [0.0]), run_of_three_seeds("f4sg", 1.0, [0.0])
     (tmp_path / "x.json").write_text(json.dumps([*stored, elsewhere | {"task": "switch"}, noticed]))
     lines = [line.split(" | ") for line in study.as_controls(tmp_path / "x.json").splitlines()[2:]]
-    assert [line[1] for line in lines[:2]] == ["30.0 +- 10.0", "60.0 +- 20.0"]  # what is after the fifth point is not
+    assert [line[1] for line in lines[:2]] == ["30.0±10.0", "60.0±20.0"]  # what is after the fifth point is not
     assert lines[0][2:4] == ["-", "-"] and lines[1][2] == "-" and lines[1][3].startswith("30.0 [")
     assert [line[-1].rstrip(" |") for line in lines] == [f"{x} of 3" for x in (0, 2, 3, 3, 3, 3)]
 
