@@ -140,30 +140,40 @@ def as_harm(files: pathlib.Path) -> str:
 def as_controls(files: pathlib.Path) -> str:
     """What lacks a part of F4SG, or has one, and other methods, against F4SG and against MAPPO-L, until all have ended.
 
-    Of the runs in files joined by +, those on the task of the first one that do not notice every costly step. Holm
+    Of runs in files joined by + that do not notice every costly step, on tasks where more than these two have run. Holm
     corrects all tests of the table together.
     """
-    stored = joined(runs.load(files))
-    compared = [run for run in stored if run["task"] == stored[0]["task"] and share(run) < 1]
-    found = {run.get("label", run["method"]): run for run in compared}
-    end = min(run["steps"][-1] for run in found.values())
-    together = all(run["steps"][-1] == end for run in found.values())  # then the figures of all rows count
-    scores = {name: measures(run) if together else _until(run, end) for name, run in found.items()}
-    lines = {name: words for name, words in CONTROLS.items() if name in found}
-    tested = [(name, other) for name in lines for other in PAIR if name not in (other, PAIR[0])]
-    p = holm([welch_test(scores[name]["training"], scores[other]["training"]) for name, other in tested])
+    found: dict[str, dict[str, runs.Run]] = {}
+    for run in joined(runs.load(files)):
+        label = run.get("label", run["method"])
+        if share(run) < 1 and label in CONTROLS:
+            found.setdefault(run["task"], {})[label] = run
+    found = {task: cell for task, cell in found.items() if set(cell) - set(PAIR)}
+    scores = {task: _until_all_ended(cell) for task, cell in found.items()}
+    lines = [(task, name) for task, cell in found.items() for name in CONTROLS if name in cell]
+    tested = [(*line, other) for line in lines for other in PAIR if line[1] not in (other, PAIR[0])]
+    harm = {line: scores[line[0]][line[1]]["training"] for line in lines}
+    p = holm([welch_test(harm[task, name], harm[task, other]) for task, name, other in tested])
     against = {}
-    for (name, other), corrected in zip(tested, p, strict=True):
-        difference = _difference(scores[name]["training"], scores[other]["training"])
-        against[name, other] = f"{difference}, {p_value(corrected)}"
+    for (task, name, other), corrected in zip(tested, p, strict=True):
+        against[task, name, other] = f"{_difference(harm[task, name], harm[task, other])}, {p_value(corrected)}"
     body = []
-    for name, words in lines.items():
-        own, limit = scores[name], _limit(found[name])
-        line = [words, mean_sd(own["training"]), *(against.get((name, other), "-") for other in reversed(PAIR))]
+    for task, name in lines:
+        own, limit = scores[task][name], _limit(found[task][name])
+        line = [*[f"`{task}`"] * (len(found) > 1), CONTROLS[name], mean_sd(own["training"])]
+        line += [against.get((task, name, other), "-") for other in reversed(PAIR)]
         line += [mean_sd(own["end"]), mean_sd(own["reward"]), f"{(own['end'] > limit).sum()} of {own['end'].size}"]
         body.append(line)
     less = [f"less {NAMES[other]}'s [95 %], d, p" for other in reversed(PAIR)]
-    return markdown(["", "harm, of 1,000 steps", *less, "true cost at the end", "reward", "seeds beyond"], body)
+    head = [*["task"] * (len(found) > 1), "", "harm, of 1,000 steps", *less, "true cost at the end", "reward"]
+    return markdown([*head, "seeds beyond"], body)
+
+
+def _until_all_ended(cell: dict[str, runs.Run]) -> dict[str, dict[str, Scores]]:
+    """The measures of each run, as if all had ended with the first; of all rows where they did."""
+    end = min(run["steps"][-1] for run in cell.values())
+    together = all(run["steps"][-1] == end for run in cell.values())
+    return {name: measures(run) if together else _until(run, end) for name, run in cell.items()}
 
 
 def as_equivalence(files: pathlib.Path) -> str:

@@ -91,6 +91,7 @@ def main(names: list[str]) -> None:
     for name in names or FIGURES:
         result, task = FIGURES[name]
         found = [run for run in runs.load(records.RESULTS / f"{result}.json") if run["task"] == task]
+        found = [run for run in found if run.get("label", run["method"]) == run["method"]]  # none with other settings
         panels = {"grid_33": GRID_PANELS, "harm": HARM_PANELS}.get(name, PANELS)
         draw(plot.pooled([runs.curves(run) for run in found]), DOCS / f"{name}.png", panels)
         print(f"docs/{name}.png")

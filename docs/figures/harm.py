@@ -17,7 +17,7 @@ from pmt_jax.studies.plot import METHOD_COLOURS
 from . import style
 
 FILE = pathlib.Path(__file__).parents[1] / "harm_by_task.png"
-RESULT = records.RESULTS / "fear_h200+fear_multiplier+fear_voltage_33.json"
+RESULT = records.RESULTS / "fear_h200+fear_voltage_33.json"
 APART = 0.17  # of the two methods' rows from the middle of a task's
 
 

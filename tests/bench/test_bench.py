@@ -791,6 +791,29 @@ def test_controls_are_compared_where_all_have_run(tmp_path: pathlib.Path):
     assert [line[-1].rstrip(" |") for line in lines] == [f"{x} of 3" for x in (0, 2, 3, 3, 3, 3)]
 
 
+def test_controls_on_several_tasks_name_them(tmp_path: pathlib.Path):
+    """Of tasks on which MAPPO-L and F4SG alone have run, there is none."""
+    spread = np.linspace(0, 0.1, 6)
+    cells = [
+        run_of_three_seeds(method, 0.5, list(mean + spread)) | {"task": task}
+        for task, methods in (
+            ("lane", ("mappo_l", "f4sg", "macpo")),
+            ("noisy", study.PAIR),
+            ("switch", ("f4sg", "r4sg")),
+        )
+        for mean, method in enumerate(methods, 1)
+    ]
+    (tmp_path / "x.json").write_text(json.dumps([run | {"label": run["method"]} for run in cells]))
+    (tmp_path / "y.json").write_text(
+        json.dumps([run_of_three_seeds("mappo_l", 0.5, list(2 + spread)) | {"task": "switch"}])
+    )
+    head, _, *lines = study.as_controls(tmp_path / "x+y.json").splitlines()
+    assert head.startswith("| task |  | harm") and len(lines) == 6
+    assert [line.split(" | ")[0] for line in lines] == ["| `lane`"] * 3 + ["| `switch`"] * 3
+    assert [line.split(" | ")[1] for line in lines[3:]] == ["MAPPO-L", "F4SG", "R4SG"]
+    assert lines[5].split(" | ")[4].startswith("0.0 [") and lines[5].split(" | ")[4].endswith(", 1")
+
+
 def test_equivalence_is_what_an_interval_within_the_bounds_shows(tmp_path: pathlib.Path):
     """The mean's interval at 90 % is within 10 % of 100 +- 1, and is not of 100 +- 20; constant rewards are equal."""
     for costs, words in (([9.9, 10.0, 10.1], "yes"), ([8.0, 10.0, 12.0], "not shown")):
