@@ -264,16 +264,17 @@ def test_fused_on_a_gpu_is_the_same_source_on_a_cpu(name):
 
 
 @compiled
-@pytest.mark.parametrize(("name", "vases"), [("point", 2), ("point", 4), ("ant", 0)])
+@pytest.mark.parametrize(("name", "vases"), [("point", 2), ("point", 4), ("ant", 0), ("ant", 1), ("ant", 4)])
 def test_robots_among_vases_on_a_gpu_are_the_same_source_on_a_cpu(name, vases):
     model, rows = goals.model(name, 2, vases, 1.5), crowded(name, vases, 200).astype(np.float32)
     made_of = tables(model, goals.SUBSTEPS, {"qacc": ("qacc", slice(None))}, forward=True)
     states = np.split(rows, np.cumsum([model.nq, model.nv, model.nv]), axis=1)
     qpos, qvel, _, overflow, _ = jax.jit(gpu.make_step(made_of))(*map(jnp.asarray, states))
     right = runner(made_of, np.float32)(*states)
-    assert not np.asarray(overflow).any()
+    whole = np.asarray(overflow).ravel() == 0
+    assert whole.mean() > (0.9 if (name, vases) == ("ant", 4) else 1 - 1e-9)  # as in test_fused_threads.py
     for found, expected, most in ((qpos, right["qpos"], 2e-5), (qvel, right["qvel"], 5e-3)):
-        error = np.abs(np.asarray(found) - expected).max(axis=1)
+        error = np.abs(np.asarray(found) - expected).max(axis=1)[whole]
         print(f"{name}, {vases} vases: median {np.median(error):.2g}, largest {error.max():.2g}")
         assert np.quantile(error, 0.9) < most
 

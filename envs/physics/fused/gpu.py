@@ -45,7 +45,7 @@ class Kernel:
     results: tuple[tuple[int, ...], ...]
     rank: int = 1
     blocks: int = 1
-    threads: int = threads.LANES
+    threads: int = threads.THREADS
     way: Way | None = None
     crowded: tuple[int, Kernel] | None = None
 

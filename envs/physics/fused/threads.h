@@ -7,7 +7,7 @@
 //
 // The same source compiles for a CPU, where EACH_LANE is a loop. Rules: in a phase (the body of EACH_LANE) no lane
 // reads what another lane writes in it, and MEET ends a phase whose results other lanes need. What a lane keeps from
-// one phase to another is a PerLane.
+// one phase to another is a PerLane. A model with more than 32 items of a kind has 64 lanes, and a thread holds two.
 //
 // Everything inside an evaluation is in the base's frame: that of the free root, with its origin, or else the world's.
 // Only the height of the base and the directions "up" and "world's y" enter: places far from the origin cost no bits.
@@ -24,9 +24,6 @@ typedef REAL real;
 #define APART static __device__ __noinline__  // what runs once a step stays out of the way of what runs twenty times
 #define TABLE(type) static __device__ const __align__(16) type
 #define CONSTANT static __device__ constexpr
-#define EACH_LANE if (const int lane = int(threadIdx.x); true)
-#define HELD 1  // lanes whose values a thread holds
-#define ME 0    // where it holds this lane's
 #define MEET() __syncwarp()
 #define UNROLLED _Pragma("unroll")
 #define ROLLED _Pragma("unroll 1")
@@ -36,22 +33,10 @@ typedef REAL real;
 #define APART static
 #define TABLE(type) static const type
 #define CONSTANT static constexpr
-#define EACH_LANE for (int lane = 0; lane < LANES; ++lane)
-#define HELD LANES
-#define ME lane
 #define MEET()
 #define UNROLLED
 #define ROLLED
 #endif
-
-constexpr int LANES = 32;
-
-template <class X>
-struct PerLane {
-  X value[HELD];
-  MEMBER X& operator[](int held) { return value[held]; }
-  MEMBER const X& operator[](int held) const { return value[held]; }
-};
 
 // Loops whose index is a constant in their body, so that tables fold and small arrays stay in registers.
 template <int I>
@@ -177,20 +162,66 @@ DEVICE void put(real* to, const Mat& m) {
 DEVICE Vec vec_at(const real* from) { return {from[0], from[1], from[2]}; }
 DEVICE Mat mat_at(const real* from) { return {vec_at(from), vec_at(from + 3), vec_at(from + 6)}; }
 
-// ---- across lanes: every sum has one order, so that runs repeat bit for bit ---------------------------------------
+// ---- lanes ----------------------------------------------------------------------------------------------------------
+#include MODEL  // the tables, which say how many lanes there are
+
+#define THREADS 32  // of a block
+#ifndef __CUDACC__
+#define HELD LANES  // lanes whose values a thread holds
+#define ME lane     // where it holds this lane's
+#define EACH_LANE for (int lane = 0; lane < LANES; ++lane)
+#define EACH_THREAD for (int lane = 0; lane < THREADS; ++lane)  // the first 32 lanes, which take several items each
+#elif LANES == THREADS
+#define HELD 1
+#define ME 0
+#define EACH_LANE if (const int lane = int(threadIdx.x); true)
+#define EACH_THREAD EACH_LANE
+#else
+#define HELD (LANES / THREADS)
+#define ME held
+#define EACH_LANE                                  \
+  UNROLLED for (int held = 0; held < HELD; ++held) \
+    if (const int lane = int(threadIdx.x) + THREADS * held; true)
+#define EACH_THREAD if (const int held = 0, lane = int(threadIdx.x); true)
+#endif
+
+template <class X>
+struct PerLane {
+  X value[HELD];
+  MEMBER X& operator[](int held) { return value[held]; }
+  MEMBER const X& operator[](int held) const { return value[held]; }
+};
+
+// Across lanes. Every sum has one order, so that runs repeat bit for bit. A ballot is of the first 32 lanes: no other has
+// a contact.
 #ifdef __CUDACC__
 DEVICE real sum(const PerLane<real>& x) {
   real y = x[0];
-  UNROLLED for (int offset = LANES / 2; offset; offset >>= 1) y += __shfl_xor_sync(0xffffffffu, y, offset);
+  UNROLLED for (int k = 1; k < HELD; ++k) y += x[k];
+  UNROLLED for (int offset = THREADS / 2; offset; offset >>= 1) y += __shfl_xor_sync(0xffffffffu, y, offset);
   return y;
 }
 DEVICE unsigned ballot(const PerLane<bool>& x) { return __ballot_sync(0xffffffffu, x[0]); }
-DEVICE bool any(const PerLane<bool>& x) { return __any_sync(0xffffffffu, x[0]); }
+DEVICE bool any(const PerLane<bool>& x) {
+  bool y = x[0];
+  UNROLLED for (int k = 1; k < HELD; ++k) y = y || x[k];
+  return __any_sync(0xffffffffu, y);
+}
 DEVICE PerLane<real> gathered(const PerLane<real>& x, const PerLane<int>& source) {
-  return {{__shfl_sync(0xffffffffu, x[0], source[0])}};
+  PerLane<real> y;
+  UNROLLED for (int k = 0; k < HELD; ++k) {
+    y[k] = __shfl_sync(0xffffffffu, x[0], source[k]);  // of the thread that holds it: modulo 32
+    UNROLLED for (int from = 1; from < HELD; ++from) {
+      const real other = __shfl_sync(0xffffffffu, x[from], source[k]);
+      if (source[k] / THREADS == from) y[k] = other;
+    }
+  }
+  return y;
 }
 DEVICE int lowest(unsigned bits) { return __ffs(bits) - 1; }
+DEVICE int lowest(unsigned long long bits) { return __ffsll(bits) - 1; }
 DEVICE int count(unsigned bits) { return __popc(bits); }
+DEVICE int count(unsigned long long bits) { return __popcll(bits); }
 #else
 DEVICE real sum(const PerLane<real>& x) {
   real y[LANES];
@@ -201,15 +232,20 @@ DEVICE real sum(const PerLane<real>& x) {
 }
 DEVICE unsigned ballot(const PerLane<bool>& x) {
   unsigned bits = 0;
-  for (int i = 0; i < LANES; ++i) bits |= unsigned(x[i]) << i;
+  for (int i = 0; i < THREADS; ++i) bits |= unsigned(x[i]) << i;
   return bits;
 }
-DEVICE bool any(const PerLane<bool>& x) { return ballot(x) != 0; }
+DEVICE bool any(const PerLane<bool>& x) {
+  for (int i = 0; i < LANES; ++i) {
+    if (x[i]) return true;
+  }
+  return false;
+}
 DEVICE PerLane<real> gathered(const PerLane<real>& x, const PerLane<int>& source) {
   PerLane<real> y;
   for (int i = 0; i < LANES; ++i) y[i] = x[source[i]];
   return y;
 }
-DEVICE int lowest(unsigned bits) { return __builtin_ctz(bits); }
-DEVICE int count(unsigned bits) { return __builtin_popcount(bits); }
+DEVICE int lowest(unsigned long long bits) { return __builtin_ctzll(bits); }
+DEVICE int count(unsigned long long bits) { return __builtin_popcountll(bits); }
 #endif

@@ -1,9 +1,9 @@
 """The tables of a model as C++ for the schedule "one warp a world": threads.h and threads_*.h.
 
-The warp's lanes take the model's items (joints, bodies, dofs, entries of matrices, contacts), so what differs between
-items is looked up by lane, and what is the same for all becomes a constant. The order in which M's factor is computed
-is decided here: the trunk (dofs 0 to T - 1, one path) by all lanes alike, the branches on it in rounds, each dof in the
-round after the last of those that hang on it.
+The warp's lanes, 32 or 64, take the model's items (joints, bodies, dofs, entries of matrices, contacts), so what
+differs between items is looked up by lane, and what is the same for all becomes a constant. The order in which M's
+factor is computed is decided here: the trunk (dofs 0 to T - 1, one path) by all lanes alike, the branches on it in
+rounds, each dof in the round after the last of those that hang on it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 
 from .model import FIELDS, Contact, Impedance, Tables, dofs_of
 
-LANES = 32
-MOST_SLOTS = LANES  # contacts of a world at a time, each a lane's
+THREADS = 32
+MOST_LANES = 2 * THREADS  # a thread holds two of a wide model's
+MOST_SLOTS = THREADS  # contacts of a world at a time, each a lane's
 MOST_SEGMENTS, MOST_PAIRS = 512, 4096  # what a multiprocessor's memory has room for in each of its worlds
 MOST_BYTES = 49_152  # of memory that a block's threads share, without asking for more
 
@@ -41,13 +42,7 @@ class Schedule(NamedTuple):
 
 def obstacle(tables: Tables) -> str | None:
     """Why a warp cannot step a world of the model, as the rest of a sentence; None if it can."""
-    sizes = {
-        "degrees of freedom": (tables.nv, LANES),
-        "joints": (len(tables.joints), LANES),
-        "actuators": (tables.nu, LANES),
-        "moving bodies": (len(tables.bodies), LANES),
-        "joints with limits": (len(tables.limits), LANES),
-        "bodies in a fluid": (len(tables.boxes), LANES),
+    sizes = {what: (size, MOST_LANES) for what, size in _items(tables).items()} | {
         "spheres and capsules that may touch others": (len(tables.segments), MOST_SEGMENTS),
         "pairs of geoms that may touch": (len(tables.pairs), MOST_PAIRS),
     }
@@ -60,14 +55,32 @@ def obstacle(tables: Tables) -> str | None:
     return None
 
 
+def _items(t: Tables) -> dict[str, int]:
+    """What has a lane for each."""
+    return {
+        "degrees of freedom": t.nv,
+        "joints": len(t.joints),
+        "actuators": t.nu,
+        "moving bodies": len(t.bodies),
+        "joints with limits": len(t.limits),
+        "bodies in a fluid": len(t.boxes),
+    }
+
+
+def lanes(tables: Tables) -> int:
+    """Of a world's warp: one a thread, or two."""
+    return THREADS if max(_items(tables).values()) <= THREADS else MOST_LANES
+
+
 def shared_bytes(t: Tables) -> int:
     """Of what the lanes of a world share: `World` in threads_smooth.h, to some 100 bytes."""
     trunk, more, slots = schedule(t).trunk, t.directions > 3, _slot_count(t)
     packed = trunk * (trunk + 3) // 2 + 4
     numbers = max(17 * (len(t.joints) + 1), 7 * t.nv, packed + 2 * t.nv + 4)
-    numbers += t.nv * (_fours(t.nv) + (t.nv + 1 | 1) + 7 + 14) + 2 * t.nq + 9 + 35 * len(t.bodies) + 14 * len(t.boxes)
+    numbers += t.nv * (_fours(_kept(t)[0]) + (t.nv + 1 | 1) + 7 + 14)
+    numbers += 2 * t.nq + 9 + 35 * len(t.bodies) + 14 * len(t.boxes)
     numbers += slots * (_fours((8 if more else 4) * _most_columns(t)) + (24 if more else 12))
-    numbers += 0 if _own_slots(t) else 13 * slots + t.nv
+    numbers += 0 if _own_slots(t) else (13 + (t.nv > 32)) * slots + t.nv
     numbers += 2 * t.nu + (7 * (len(t.segments) + 1) + len(t.pairs) // 2 if t.pairs else 0)
     return 4 * numbers
 
@@ -76,6 +89,16 @@ def _fours(count: int) -> int:
     """As in threads_smooth.h."""
     fours = -(-count // 4)
     return 4 * (fours if fours % 2 else fours + 1)
+
+
+def _kept(t: Tables) -> tuple[int, list[int]]:
+    """How many columns of M are kept, and the first of each row: of wide models whole fours with the dof's tree."""
+    if lanes(t) == THREADS:
+        return t.nv, [0] * t.nv
+    roots = [(d, *t.ancestors[d])[-1] for d in range(t.nv)]
+    last = {root: d for d, root in enumerate(roots)}
+    columns = max(-(-(last[root] + 1 - root // 4 * 4) // 4) * 4 for root in last)
+    return columns, [min(root // 4 * 4, -(-t.nv // 4) * 4 - columns) for root in roots]
 
 
 def _most_columns(t: Tables) -> int:
@@ -112,7 +135,7 @@ def _rounds(tables: Tables, trunk: int) -> tuple[tuple[int, ...], ...]:
 
 
 def source(tables: Tables) -> str:
-    """The file MODEL that threads_step.h includes."""
+    """The file MODEL that threads.h includes."""
     out = _Writer()
     _sizes(out, tables)
     _tree(out, tables)
@@ -191,6 +214,14 @@ class _Writer:
         else:
             self.scalars(name, values, "int")
 
+    def sets(self, name: str, values: Sequence[int], bits: int) -> None:
+        """Dofs, from two words where one has too few bits."""
+        if bits <= 32:
+            return self.scalars(name, values, "unsigned")
+        self.scalars(f"{name}_low", (value & 0xFFFFFFFF for value in values), "unsigned")
+        self.scalars(f"{name}_high", (value >> 32 for value in values), "unsigned")
+        self._after(f"DEVICE Dofs {name}(int i) {{ return Dofs({name}_high(i)) << 32 | {name}_low(i); }}")
+
     def vectors(self, name: str, values: Iterable[np.ndarray]) -> None:
         rows = np.array(list(values), float).reshape(-1, 3)
         for k, part in enumerate("xyz"):
@@ -223,7 +254,9 @@ def _number(value: float) -> str:
 
 
 def _sizes(out: _Writer, t: Tables) -> None:
+    out.line(f"typedef unsigned{' long long' * (t.nv > 32)} Dofs;  // a bit each")
     out.define(
+        LANES=lanes(t),
         NQ=t.nq,
         NV=t.nv,
         NU=t.nu,
@@ -289,7 +322,7 @@ def _tree(out: _Writer, t: Tables) -> None:
     dragged = {box.body for box in t.boxes}
     out.fixed("BODY_PARENT", [b.parent for b in t.bodies])
     out.fixed("BODY_CHANGES", [k in parents | dragged for k in range(len(t.bodies))])
-    out.scalars("body_dofs", (_bits(b.chain) for b in t.bodies), "unsigned")
+    out.sets("body_dofs", [_bits(b.chain) for b in t.bodies], t.nv)
     owner = {dof: j.body for j in t.joints for dof in dofs_of(j)}
     with out.record("dof"):
         for name in ("armature", "damping", "stiffness", "spring"):
@@ -358,7 +391,10 @@ def _entries(out: _Writer, t: Tables) -> None:
     """Entries of M and H."""
     base = 6 if t.has_free else 0
     pairs = [(i, j) for i in range(base, t.nv) for j in (i, *t.ancestors[i]) if j >= base]
-    out.define(PAIR_ENTRIES=len(pairs), OUTER_DOFS=((1 << t.nv) - 1) & ~((1 << base) - 1))
+    columns, first = _kept(t)
+    out.define(PAIR_ENTRIES=len(pairs), M_COLUMNS=columns)
+    out.scalars("first_column", first, "int")
+    out.line(f"#define OUTER_DOFS {((1 << t.nv) - 1) & ~((1 << base) - 1)}u")
     out.scalars("pair_entry", (i | j << 8 for i, j in pairs), "unsigned")
     # The base's block: the first moment h crosswise, then the inertia; mass and zeros never change.
     block = [(3, 1, 2, 1), (3, 2, 1, 0), (4, 0, 2, 0), (4, 2, 0, 1), (5, 0, 1, 1), (5, 1, 0, 0)]
@@ -462,8 +498,8 @@ def _contacts(out: _Writer, t: Tables) -> None:
         out.scalars("contact_dims", (c.dims for c in contacts), "int")
         for name in Impedance._fields:
             out.scalars(f"contact_{name}", (getattr(c.impedance, name) for c in contacts))
-        out.scalars("contact_dofs", dofs, "unsigned")
-        out.scalars("contact_opposite", [0] * len(t.points) + minus, "unsigned")
+        out.sets("contact_dofs", dofs, t.nv)
+        out.sets("contact_opposite", [0] * len(t.points) + minus, t.nv)
         out.scalars("contact_fills", [False] * len(t.points) + fills, "bool")
     first = [-1] * len(t.points) + [(t.blocks if p.blocks else t.segments)[p.first].place for p in t.pairs]
     second = [p.place for p in t.points]

@@ -22,7 +22,7 @@ struct Contact {
   real weight;                // D of an edge
   real residual[DIRECTIONS];  // J a - aref
   real change[DIRECTIONS];    // of it along the step
-  unsigned dofs;              // those that move the two bodies apart
+  Dofs dofs;                  // those that move the two bodies apart
 };
 constexpr int EDGES = 2 * (DIRECTIONS - 1);  // the most of a contact
 
@@ -140,8 +140,8 @@ DEVICE Nearest nearest_of(Vec a, Vec half_a, Vec b, Vec half_b, real reach, int 
 
 // A lane a segment: where it is.
 DEVICE void place_segments(World& w) {
-  EACH_LANE {
-    for (int k = lane; k < SEGMENTS; k += LANES) {
+  EACH_THREAD {
+    for (int k = lane; k < SEGMENTS; k += THREADS) {
       const real* pose = w.pose[segment_body(k)];
       const Mat R = mat_at(pose);
       put(w.segment[k], mul(R, segment_centre(k)) + vec_at(pose + 9));
@@ -201,13 +201,13 @@ DEVICE bool is_near(const World& w, int pair) {
 // Lists the pairs from `first` to before `last` that may touch, and returns how many.
 DEVICE int list_near(World& w, int first, int last) {
   int found = 0;
-  ROLLED for (int start = first; start < last; start += LANES) {
+  ROLLED for (int start = first; start < last; start += THREADS) {
     PerLane<bool> near;
-    EACH_LANE {
+    EACH_THREAD {
       near[ME] = start + lane < last && is_near(w, start + lane);
     }
     const unsigned hits = ballot(near);
-    EACH_LANE if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
+    EACH_THREAD if (near[ME]) w.near[found + count(hits & ((1u << lane) - 1u))] = short(start + lane);
     found += count(hits);
   }
   MEET();
@@ -288,7 +288,7 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
 DEVICE int take(World& w, const PerLane<bool>& hit, const PerLane<int>& candidate, const PerLane<Touch>& touch,
                 int found) {
   const unsigned hits = ballot(hit);
-  EACH_LANE {
+  EACH_THREAD {
     const int slot = found + count(hits & ((1u << lane) - 1u));
     if (hit[ME] && slot < SLOTS) {
       real* to = w.contact[slot];
@@ -324,18 +324,18 @@ DEVICE void touch_boxes(const World& w, int pair, Touches& found, BlockFrame& in
 // Puts the contacts of two boxes into the next free slots. Returns how many there are then.
 DEVICE int collect_boxes(World& w, PerLane<Touch>& touch, int found) {
   const int near = list_near(w, ONE_BY_ONE, PAIRS);
-  ROLLED for (int start = 0; start < near; start += LANES) {
+  ROLLED for (int start = 0; start < near; start += THREADS) {
     PerLane<Touches> touches;
     PerLane<BlockFrame> in;
     PerLane<int> candidate;
-    EACH_LANE {
+    EACH_THREAD {
       touches[ME].count = 0;
       candidate[ME] = POINTS + (start + lane < near ? w.near[start + lane] : 0);
       if (start + lane < near) touch_boxes(w, candidate[ME] - POINTS, touches[ME], in[ME]);
     }
     ROLLED for (int k = 0; k < MOST_TOUCHES; ++k) {
-      PerLane<bool> hit;
-      EACH_LANE {
+      PerLane<bool> hit = {};
+      EACH_THREAD {
         const Touches& all = touches[ME];
         hit[ME] = k < all.count;
         if (hit[ME]) {
@@ -358,8 +358,8 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
   PerLane<bool> hit;
   PerLane<int> candidate;
   int found = 0;
-  ROLLED for (int start = 0; start < POINTS; start += LANES) {
-    EACH_LANE {
+  ROLLED for (int start = 0; start < POINTS; start += THREADS) {
+    EACH_THREAD {
       candidate[ME] = start + lane;
       hit[ME] = start + lane < POINTS && touches_floor(w, start + lane, touch[ME]);
     }
@@ -368,8 +368,8 @@ DEVICE int collect_contacts(World& w, PerLane<Contact>& contacts, PerLane<Touch>
 #if PAIRS > 0
   place_segments(w);
   const int near = list_near(w, 0, ONE_BY_ONE);  // parallel capsules touch twice
-  ROLLED for (int start = 0; start < 2 * near; start += LANES) {
-    EACH_LANE {
+  ROLLED for (int start = 0; start < 2 * near; start += THREADS) {
+    EACH_THREAD {
       const int item = start + lane, pair = item < 2 * near ? w.near[item >> 1] : 0;
       candidate[ME] = POINTS + pair;
       hit[ME] = item < 2 * near && (has_block(pair) ? touches_block(w, pair, item & 1, touch[ME])
@@ -427,9 +427,9 @@ DEVICE void put_columns(World& w, int slot, const Directions& d, real damping, C
   }
 #endif
 #if PAIRS > 0
-  const unsigned opposite = contact_opposite(contact.candidate);
+  const Dofs opposite = contact_opposite(contact.candidate);
 #endif
-  for (unsigned dofs = contact.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) {
+  for (Dofs dofs = contact.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) {
     const int dof = lowest(dofs);
     const Vec angular = vec_at(w.axis[dof]), linear = vec_at(w.axis[dof] + 3);
     real row[DIRECTIONS];
@@ -451,7 +451,7 @@ DEVICE int column_of(const World& w, int slot, int dof) {
 #if OWN_SLOTS
   return dof_column(dof);
 #else
-  return count(w.moved[slot] & ((1u << dof) - 1u));
+  return count(w.moved[slot] & ((Dofs(1) << dof) - 1));
 #endif
 }
 

@@ -97,7 +97,7 @@ DEVICE void put_velocity(const World& w, int row, real* to) {
     linear = vec_at(w.velocity);
     angular = vec_at(w.velocity + 3);
 #endif
-    for (unsigned dofs = body_dofs(body) & OUTER_DOFS; dofs; dofs &= dofs - 1) {
+    for (Dofs dofs = body_dofs(body) & OUTER_DOFS; dofs; dofs &= dofs - 1) {
       const int dof = lowest(dofs);
       angular = angular + vec_at(w.axis[dof]) * w.velocity[dof];
       linear = linear + vec_at(w.axis[dof] + 3) * w.velocity[dof];
@@ -188,8 +188,8 @@ DEVICE void put_row(const World& w, int row, unsigned existing, real* to) {
 APART void read_rows(World& w, unsigned existing, const Outputs out) {
   repeat<0, READINGS>([&](auto number) {
     constexpr int reading = number;
-    EACH_LANE {
-      ROLLED for (int k = lane; k < READING_COUNT[reading]; k += LANES) {
+    EACH_THREAD {
+      ROLLED for (int k = lane; k < READING_COUNT[reading]; k += THREADS) {
         const int row = reading_row(READING_START[reading] + k);
         put_row<READING_FIELD[reading]>(w, row, existing, out.reading[reading] + k * READING_WIDTH[reading]);
       }

@@ -1,13 +1,12 @@
-// Where bodies are, and forces without constraints; see threads.h. MODEL is the file of tables that threads.py writes.
+// Where bodies are, and forces without constraints; see threads.h.
 #pragma once
 #include "threads.h"
-#include MODEL
 
 // Rows of shared memory that lanes read at a stride: whole fours that meet all banks, or an odd number of singles.
 constexpr int fours(int n) { return (n + 3) / 4 % 2 ? (n + 3) / 4 * 4 : (n + 3) / 4 * 4 + 4; }
 
 constexpr int WIDTH = (NV + 1) | 1;  // of a row of H: its last column is the right side
-constexpr int M_WIDTH = fours(NV);
+constexpr int M_WIDTH = fours(M_COLUMNS);
 constexpr int PACKED = TRUNK * (TRUNK + 1) / 2 + TRUNK;  // the trunk's lower triangle, then its right side
 constexpr int MORE = DIRECTIONS > 3;  // of contacts: spin and rolling
 constexpr int COLUMN = 4 + 4 * MORE;  // of a contact's Jacobian: normal, two tangents, a gap; spin, rolling, a gap
@@ -32,7 +31,7 @@ struct alignas(16) World {
     };
   };
   alignas(16) real acceleration[(NV + 3) / 4 * 4];  // the solver's qacc, in the base's frame
-  alignas(16) real M[NV * M_WIDTH];
+  alignas(16) real M[NV * M_WIDTH];  // see at_M
   alignas(16) real J[SLOTS * J_WIDTH];
   // A contact's weights nn n1 n2 11 22 and, from the ninth, its force n 1 2; then of spin and rolling n3 n4 n5 33 44 55
   // and, from the twenty-first, their moments.
@@ -66,9 +65,12 @@ struct alignas(16) World {
   real contact[SLOTS][11];
   int candidate[SLOTS];
   unsigned touching[NV];  // contacts that a dof moves
-  unsigned moved[SLOTS];  // dofs that a contact moves with
+  Dofs moved[SLOTS];      // dofs that a contact moves with
 #endif
 };
+
+// Where M has an entry. Of a wide model's rows only the columns of the dof's own tree are kept.
+DEVICE int at_M(int i, int j) { return i * M_WIDTH + j - first_column(i); }
 
 // Four numbers at once.
 #ifdef __CUDACC__
@@ -308,8 +310,8 @@ DEVICE void find_forces(World& w) {
       if constexpr (FREE) {
         const real row[6] = {push.x, push.y, push.z, turn.x, turn.y, turn.z};
         UNROLLED for (int k = 0; k < 6; ++k) {
-          w.M[lane * M_WIDTH + k] = row[k];
-          w.M[k * M_WIDTH + lane] = row[k];
+          w.M[at_M(lane, k)] = row[k];
+          w.M[at_M(k, lane)] = row[k];
         }
       }
     }
@@ -320,38 +322,38 @@ DEVICE void find_forces(World& w) {
 
 // The entries of M that change: pairs of dofs on one chain, and the base's block.
 DEVICE void find_inertia(World& w) {
-  EACH_LANE {
-    UNROLLED for (int e = lane; e < PAIR_ENTRIES; e += LANES) {
+  EACH_THREAD {
+    UNROLLED for (int e = lane; e < PAIR_ENTRIES; e += THREADS) {
       const unsigned entry = pair_entry(e);
       const int i = entry & 255, j = entry >> 8;
       const real* a = w.axis[j];
       const real* b = w.momentum[i];
       real y = i == j ? dof_armature(i) : real(0);
       UNROLLED for (int k = 0; k < 6; ++k) y += a[k] * b[k];
-      w.M[i * M_WIDTH + j] = y;
-      w.M[j * M_WIDTH + i] = y;
+      w.M[at_M(i, j)] = y;
+      w.M[at_M(j, i)] = y;
     }
     if (FREE && lane < BASE_ENTRIES) {
       const unsigned entry = base_entry(lane);  // i, j, which of the sums, whether its sign changes
       const int i = entry & 255, j = entry >> 8 & 255;
       const real x = w.sums[0][entry >> 16 & 255];
       const real y = (entry >> 24 ? -x : x) + (i == j ? dof_armature(i) : real(0));
-      w.M[i * M_WIDTH + j] = y;
-      w.M[j * M_WIDTH + i] = y;
+      w.M[at_M(i, j)] = y;
+      w.M[at_M(j, i)] = y;
     }
   }
 }
 
 // What is the same in all evaluations of a step, and what is never written.
 DEVICE void clear(World& w) {
-  EACH_LANE {
-    ROLLED for (int k = lane; k < NV * M_WIDTH; k += LANES) w.M[k] = 0;
-    ROLLED for (int k = lane; k < NV * WIDTH; k += LANES) w.H[k] = 0;
+  EACH_THREAD {
+    ROLLED for (int k = lane; k < NV * M_WIDTH; k += THREADS) w.M[k] = 0;
+    ROLLED for (int k = lane; k < NV * WIDTH; k += THREADS) w.H[k] = 0;
     if (lane < 4) w.acceleration[(NV + 3) / 4 * 4 - 4 + lane] = 0;
   }
   MEET();
 #if FREE
-  EACH_LANE if (lane < 3) w.M[lane * M_WIDTH + lane] = body_subtree_mass(0) + dof_armature(lane);
+  EACH_LANE if (lane < 3) w.M[at_M(lane, lane)] = body_subtree_mass(0) + dof_armature(lane);
   MEET();
 #endif
 }

@@ -3,16 +3,18 @@
 #include "threads_contacts.h"
 
 constexpr int LINE_SEARCH_STEPS = 12;
+constexpr real IMPROVEMENT = sizeof(real) == 4 ? real(1e-9) : real(1e-12);  // the least worth a step, as lanes_solver.h has it
 
 // M x of a lane's dof.
 DEVICE real times_inertia(const World& w, const real* x, int dof) {
+  const int first = first_column(dof);
   real y = 0;
-  UNROLLED for (int j = 0; j < NV; j += 4) {
-    const Four a = four_at(w.M + dof * M_WIDTH + j), b = four_at(x + j);
+  UNROLLED for (int j = 0; j < M_COLUMNS; j += 4) {
+    const Four a = four_at(w.M + dof * M_WIDTH + j), b = four_at(x + first + j);
     y += a.x * b.x;
-    if (j + 1 < NV) y += a.y * b.y;
-    if (j + 2 < NV) y += a.z * b.z;
-    if (j + 3 < NV) y += a.w * b.w;
+    if (first + j + 1 < NV) y += a.y * b.y;
+    if (first + j + 2 < NV) y += a.z * b.z;
+    if (first + j + 3 < NV) y += a.w * b.w;
   }
   return y;
 }
@@ -39,8 +41,8 @@ DEVICE void eliminate_branches(World& w) {
   if constexpr (ROUNDS <= MOST_UNROLLED) {
     repeat<0, ROUNDS>([&](auto turn) {
       constexpr int round = turn;
-      EACH_LANE {
-        UNROLLED for (int e = lane; e < ROUND_SIZE[round]; e += LANES) {
+      EACH_THREAD {
+        UNROLLED for (int e = lane; e < ROUND_SIZE[round]; e += THREADS) {
           const unsigned entry = round_entry(ROUND_START[round] + e);
           eliminate_entry(w, entry, ROUND_EVEN[round] ? ROUND_BELOW[round] : dof_below(entry & 255), round == 0);
         }
@@ -49,8 +51,8 @@ DEVICE void eliminate_branches(World& w) {
     });
   } else {
     ROLLED for (int round = 0; round < ROUNDS; ++round) {
-      EACH_LANE {
-        ROLLED for (int e = round_start(round) + lane; e < round_start(round + 1); e += LANES) {
+      EACH_THREAD {
+        ROLLED for (int e = round_start(round) + lane; e < round_start(round + 1); e += THREADS) {
           const unsigned entry = round_entry(e);
           eliminate_entry(w, entry, dof_below(entry & 255), round == 0);
         }
@@ -62,8 +64,8 @@ DEVICE void eliminate_branches(World& w) {
 
 // What branches leave of the trunk's triangle and right side.
 DEVICE void pack_trunk(World& w) {
-  EACH_LANE {
-    UNROLLED for (int e = lane; e < PACKED; e += LANES) {
+  EACH_THREAD {
+    UNROLLED for (int e = lane; e < PACKED; e += THREADS) {
       const unsigned entry = trunk_entry(e);
       const int i = entry & 255, j = entry >> 8 & 255;
       real value = w.H[i * WIDTH + j];
@@ -137,12 +139,14 @@ DEVICE void solve_full(World& w, PerLane<real>& x) {
   ROLLED for (int k = NV - 1; k >= 0; --k) {
     const real inverse = reciprocal(w.H[k * WIDTH + k]);
     const real* row = w.H + k * WIDTH;
-    EACH_LANE {
-      ROLLED for (int e = lane; e < k * (k + 1) / 2; e += LANES) {
+    EACH_THREAD {
+      ROLLED for (int e = lane; e < k * (k + 1) / 2; e += THREADS) {
         const unsigned entry = full_entry(e);
         const int i = entry & 255, j = entry >> 8;
         w.H[i * WIDTH + j] -= row[i] * inverse * row[j];
       }
+    }
+    EACH_LANE {
       if (lane < k) w.H[lane * WIDTH + NV] -= row[lane] * inverse * row[NV];
       if (lane == k) w.inverse[k] = inverse;
     }
@@ -156,8 +160,8 @@ DEVICE void solve_full(World& w, PerLane<real>& x) {
     EACH_LANE if (lane > k && lane < NV) x[ME] -= w.H[lane * WIDTH + k] * w.inverse[lane] * above[ME];
   }
   MEET();
-  EACH_LANE {
-    ROLLED for (int e = lane; e < FILL_ENTRIES; e += LANES) {
+  EACH_THREAD {
+    ROLLED for (int e = lane; e < FILL_ENTRIES; e += THREADS) {
       const unsigned entry = fill_entry(e);
       w.H[(entry & 255) * WIDTH + (entry >> 8)] = 0;
     }
@@ -282,10 +286,12 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
       gradient[ME] = y;
       w.H[lane * WIDTH + NV] = y;
     }
-    UNROLLED for (int e = lane; e < ENTRIES; e += LANES) {
+  }
+  EACH_THREAD {
+    UNROLLED for (int e = lane; e < ENTRIES; e += THREADS) {
       const unsigned entry = hessian_entry(e);
       const int i = entry & 255, j = entry >> 8 & 255;
-      real y = w.M[i * M_WIDTH + j];
+      real y = w.M[at_M(i, j)];
       if (pushing) {
         const unsigned slots = pushing & (OWN_SLOTS ? entry_slots(e) : touching(w, i) & touching(w, j));
         y += contact_entry(w, i, j, entry >> 16 & 255, entry >> 24, slots);
@@ -295,7 +301,7 @@ DEVICE void assemble(World& w, unsigned pushing, bool full, const PerLane<real>&
     }
 #if FILLS
     if (full) {
-      ROLLED for (int e = lane; e < FILL_ENTRIES; e += LANES) {
+      ROLLED for (int e = lane; e < FILL_ENTRIES; e += THREADS) {
         const unsigned entry = fill_entry(e);
         const int i = entry & 255, j = entry >> 8 & 255;
         w.H[i * WIDTH + j] = contact_entry(w, i, j, 0, 0, pushing & touching(w, i) & touching(w, j));
@@ -335,7 +341,7 @@ DEVICE bool find_changes(World& w, PerLane<Contact>& contacts, PerLane<Limit>& l
         UNROLLED for (int k = 0; k < 6; ++k) add(k);
       }
 #endif
-      for (unsigned dofs = c.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) add(lowest(dofs));
+      for (Dofs dofs = c.dofs & OUTER_DOFS; dofs; dofs &= dofs - 1) add(lowest(dofs));
       UNROLLED for (int k = 0; k < DIRECTIONS; ++k) {
         c.change[k] = after[k];
         after[k] += c.residual[k];
@@ -416,7 +422,7 @@ DEVICE void solve_constraints(World& w, PerLane<Contact>& contacts, PerLane<Limi
       PerLane<real> falls;
       EACH_LANE falls[ME] = -x[ME] * gradient[ME];
       slope = sum(falls);
-      done = !(-slope * IMPROVEMENT_SCALE > real(1e-9));  // also of what is not a number
+      done = !(-slope * IMPROVEMENT_SCALE > IMPROVEMENT);  // also of what is not a number
     }
     if (!done) {
       PerLane<real> change, one, two;

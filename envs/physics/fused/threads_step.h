@@ -78,12 +78,12 @@ DEVICE void advance(World& w) {
 }
 
 DEVICE void start_step(World& w) {
-  EACH_LANE {
-    UNROLLED for (int i = lane; i < NQ; i += LANES) w.start_qpos[i] = w.qpos[i];
-    if (lane < NV) {
-      w.start_qvel[lane] = w.qvel[lane];
-      w.sum_velocity[lane] = w.sum_acceleration[lane] = 0;
-    }
+  EACH_THREAD {
+    UNROLLED for (int i = lane; i < NQ; i += THREADS) w.start_qpos[i] = w.qpos[i];
+  }
+  EACH_LANE if (lane < NV) {
+    w.start_qvel[lane] = w.qvel[lane];
+    w.sum_velocity[lane] = w.sum_acceleration[lane] = 0;
   }
   MEET();
 }
@@ -111,14 +111,14 @@ DEVICE void take_substeps(World& w, const Outputs& out, bool& lost) {
 #else
 // Implicit in the damping: (M + h diag(damping)) a = M qacc, because M qacc is all forces at the solver's solution.
 DEVICE void damp(World& w, PerLane<real>& x) {
-  EACH_LANE {
-    UNROLLED for (int e = lane; e < ENTRIES; e += LANES) {
+  EACH_THREAD {
+    UNROLLED for (int e = lane; e < ENTRIES; e += THREADS) {
       const unsigned entry = hessian_entry(e);
       const int i = entry & 255, j = entry >> 8 & 255;
-      w.H[i * WIDTH + j] = w.M[i * M_WIDTH + j] + (i == j ? TIMESTEP * dof_damping(i) : real(0));
+      w.H[i * WIDTH + j] = w.M[at_M(i, j)] + (i == j ? TIMESTEP * dof_damping(i) : real(0));
     }
-    if (lane < NV) w.H[lane * WIDTH + NV] = times_inertia(w, w.acceleration, lane);
   }
+  EACH_LANE if (lane < NV) w.H[lane * WIDTH + NV] = times_inertia(w, w.acceleration, lane);
   MEET();
   solve_tree(w, x);
 }

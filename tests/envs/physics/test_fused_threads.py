@@ -263,8 +263,8 @@ def test_boxes_touch_boxes_as_in_c(size):
 @pytest.mark.parametrize(
     ("robot", "vases"),
     [
-        *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 2), ("ant", 0))),
-        *(pytest.param("point", x, marks=pytest.mark.slow) for x in (0, 4)),
+        *(pytest.param(*x, marks=pytest.mark.full) for x in (("point", 2), ("ant", 0), ("ant", 1))),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in (("point", 0), ("point", 4), ("ant", 4))),
     ],
 )
 def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
@@ -276,16 +276,23 @@ def test_robots_and_vases_that_touch_step_as_in_c(robot, vases):
     assert threads.obstacle(made_of) is None
     right = flat(made_of, by_c(model, rows, goals.SUBSTEPS, readout, forward=True))
     found = by_threads(model, made_of, rows)
+    whole = found["overflow"].ravel() == 0  # four vases between two ants may touch at more places than there are slots
+    assert whole.mean() > (0.9 if (robot, vases) == ("ant", 4) else 1 - 1e-9)
     for name, share in (("qpos", 0.95), ("qvel", 0.95), ("warmstart", 0.95), ("read", 0.9)):
-        assert np.quantile(errors(found[name], right[name]), share) < 1e-6, name
-    assert not found["overflow"].any()
+        assert np.quantile(errors(found[name], right[name])[whole], share) < 1e-6, name
     single = by_threads(model, made_of, rows, np.float32)
-    assert np.quantile(errors(single["qpos"], right["qpos"]), 0.9) < 2e-5
+    assert np.quantile(errors(single["qpos"], right["qpos"])[whole], 0.9) < 2e-5
+
+
+@pytest.mark.parametrize(("vases", "lanes"), [(0, 32), (1, 64)])
+def test_a_wide_model_has_two_lanes_a_thread(vases, lanes):
+    made_of = tables(goals.model("ant", 2, vases, 1.5), 1, {}, forward=True)
+    assert (threads.obstacle(made_of), threads.lanes(made_of)) == (None, lanes)
 
 
 def test_more_dofs_than_lanes_are_refused():
-    made_of = tables(goals.model("ant", 2, 1, 1.5), 1, {}, forward=True)
-    assert "34 degrees of freedom, and a warp takes 32" in str(threads.obstacle(made_of))
+    made_of = tables(goals.model("ant", 2, 7, 1.5), 1, {}, forward=True)
+    assert "70 degrees of freedom, and a warp takes 64" in str(threads.obstacle(made_of))
 
 
 # -- the order of elimination --
@@ -303,11 +310,11 @@ def test_every_dof_is_eliminated_once_and_after_those_on_it(robot):
 
 
 def test_more_bodies_than_lanes_are_refused():
-    chain = "<body pos='0 0 .1'><joint axis='0 1 0'/><geom type='sphere' size='.01'/>{}</body>"
-    text = functools.reduce(lambda inner, _: chain.format(inner), range(32), "")
+    chain = "<body pos='0 0 .1'><joint axis='0 1 0'/><geom size='.01' contype='0' conaffinity='0'/>{}</body>"
+    text = functools.reduce(lambda inner, _: chain.format(inner), range(64), "")
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     reason = threads.obstacle(tables(model, 1, {}))
-    assert reason is not None and "33 moving bodies" in reason and "32" in reason
+    assert reason is not None and "65 moving bodies" in reason and "64" in reason
 
 
 @compiled
