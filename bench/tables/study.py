@@ -124,13 +124,19 @@ def as_probe(files: pathlib.Path) -> str:
 
 
 def as_harm(files: pathlib.Path) -> str:
-    """The harm of `as_probe` alone, with p if there are several. Seeds beyond are MAPPO-L's, then F4SG's."""
+    """The harm of `as_probe` alone, with p if there are several. Seeds beyond are MAPPO-L's, then F4SG's.
+
+    Of lines that differ in the multiplier, only the one under which MAPPO-L does least harm; Holm corrects over all.
+    """
     found = pairs(files)
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
     several = len({share(pair[0]) for pair in found}) > 1
+    lines = [(pair[0]["task"], share(pair[0]), _limit(pair[0])) for pair in found]
     body = []
-    for name, pair, (theirs, ours), corrected in zip(line_names(found), found, scores, p, strict=True):
+    for line, name, pair, (theirs, ours), corrected in zip(lines, line_names(found), found, scores, p, strict=True):
+        if theirs.mean() > min(x.mean() for of, (x, _) in zip(lines, scores, strict=True) if of == line):
+            continue
         line = [name, *[f"{share(pair[0]):g}"] * several, mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
         body.append([*line, p_value(corrected), ", ".join(map(unsafe, pair))])
     head = ["task", *["p"] * several, "harm, of 1,000 steps: MAPPO-L", "F4SG", "change", "corrected p", "seeds beyond"]

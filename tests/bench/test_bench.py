@@ -774,6 +774,24 @@ def test_the_readmes_harm_is_that_of_the_study(tmp_path: pathlib.Path):
     assert short.endswith("| 2 of 2, 0 of 2 |")
 
 
+def test_the_readmes_harm_is_under_the_better_multiplier(tmp_path: pathlib.Path):
+    """A line a task: the multiplier under which MAPPO-L does less harm, named, with p corrected over both."""
+    costs = {
+        (1.0, "mappo_l"): [8.0, 9.0],
+        (1.0, "f4sg"): [1.0, 2.0],
+        (10.0, "mappo_l"): [5.0, 6.0],
+        (10.0, "f4sg"): [4.0, 4.5],
+    }
+    stored = [run_of_three_seeds(method, 0.5, cost, lambda_lr=rate) for (rate, method), cost in costs.items()]
+    (tmp_path / "x.json").write_text(json.dumps(stored))
+    (line,) = study.as_harm(tmp_path / "x.json").splitlines()[2:]
+    assert line.startswith("| `lane`, `lambda_lr` 10 | 55.0±7.1 | 42.5±3.5 |")
+    slow, fast = (
+        study.welch_test(*(10 * np.array(costs[rate, name]) for name in ("f4sg", "mappo_l"))) for rate in (1.0, 10.0)
+    )
+    assert study.p_value(study.holm([slow, fast])[1]) in line
+
+
 def test_controls_are_compared_where_all_have_run(tmp_path: pathlib.Path):
     """Up to the end of the shortest run; a line each, against F4SG and against MAPPO-L; what did not run has none."""
     stored = []

@@ -279,7 +279,7 @@ def test_findings_come_from_results(path: pathlib.Path):
 def test_all_numbers_of_the_readmes_results_are_in_its_tables(begin: str):
     text = PAGES[0].read_text()
     (section,) = (section for section in sections(text) if section.startswith(begin))
-    assert not typed(section, made(text))
+    assert not typed(section.replace("95 % interval", "interval"), made(text))  # a level is no result
 
 
 @pytest.mark.parametrize("path", NOTES, ids=page)
