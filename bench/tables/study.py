@@ -229,15 +229,21 @@ def _cell(run: runs.Run) -> str:
 
 
 def line_names(found: list[tuple[runs.Run, runs.Run]]) -> list[str]:
-    """The task of each comparison, with its limit and multiplier where lines of one probability differ in it."""
+    """The task of each comparison, with its limit where a task's lines of one probability differ in it, and all with
+    their multiplier if those of any do.
+    """
     tasks = [(theirs["task"], share(theirs)) for theirs, _ in found]
-    told = [(f"limit {_limit(x):g}", f"`lambda_lr` {runs.settings(x).get('lambda_lr', 0):g}") for x, _ in found]
-    names = []
-    for task, words in zip(tasks, told, strict=True):
-        alike = [other for of, other in zip(tasks, told, strict=True) if of == task]
-        differ = (word for word, of_all in zip(words, zip(*alike, strict=True), strict=True) if len(set(of_all)) > 1)
-        names.append(", ".join([f"`{task[0]}`", *differ]))
-    return names
+    limits = [f"limit {_limit(theirs):g}" for theirs, _ in found]
+    rates = [f"`lambda_lr` {runs.settings(theirs).get('lambda_lr', 0):g}" for theirs, _ in found]
+
+    def several(task: tuple[str, float], words: list[str]) -> bool:
+        return len({word for of, word in zip(tasks, words, strict=True) if of == task}) > 1
+
+    rated = any(several(task, rates) for task in tasks)
+    return [
+        ", ".join([f"`{task[0]}`", *[limit] * several(task, limits), *[rate] * rated])
+        for task, limit, rate in zip(tasks, limits, rates, strict=True)
+    ]
 
 
 def _effect(ours: Scores, theirs: Scores) -> str:

@@ -757,6 +757,9 @@ def test_lines_of_one_task_are_named_by_what_they_differ_in():
     assert study.line_names([slow]) == ["`lane`"]
     assert study.line_names([slow, fast]) == ["`lane`, `lambda_lr` 1", "`lane`, `lambda_lr` 10"]
     assert study.line_names([slow, pair(3.0, lambda_lr=1.0)]) == ["`lane`, limit 5", "`lane`, limit 3"]
+    other = tuple(run | {"task": "switch"} for run in fast)
+    assert study.line_names([slow, other]) == ["`lane`", "`switch`"]
+    assert study.line_names([slow, fast, other])[2] == "`switch`, `lambda_lr` 10", "all have it if one differs"
 
 
 def test_the_worst_agent_is_judged_where_agents_differ():
