@@ -158,10 +158,10 @@ def test_trees_that_no_task_has_step_as_in_c(integrator, density):
     check(model, made_of, rows, tuple(by_c(model, rows, substeps, readout) for substeps in (0, 3)), 0.9)
 
 
-def random_tree(seed: int) -> str:
-    """MJCF of ten bodies with a joint each, on a free root or on the world, each on one of those before it."""
+def random_tree(seed: int, bodies: int = 10) -> str:
+    """MJCF of bodies with a joint each, on a free root or on the world, each on one of those before it."""
     rng = np.random.default_rng(seed)
-    parents = [int(rng.integers(0, k)) for k in range(1, 10)]
+    parents = [int(rng.integers(0, k)) for k in range(1, bodies)]
 
     def body(k: int) -> str:
         axis, place, end = (" ".join(map(str, np.round(rng.normal(size=3), 2))) for _ in range(3))
@@ -183,6 +183,19 @@ def test_random_trees_step_as_in_c(seed):
     model = exact(mujoco.MjModel.from_xml_string(random_tree(seed)))
     readout = {"velocity": ("cvel", slice(None))}
     made_of, rows = tables(model, 2, readout), anywhere(model, 30, 0.5, 2.0)
+    check(model, made_of, rows, tuple(by_c(model, rows, substeps, readout) for substeps in (0, 2)), 0.9)
+
+
+@compiled
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wide_random_trees_step_as_in_c(seed):
+    """40 bodies, on the world and on a free root, in the air: more dofs, bodies, joints and limits than threads."""
+    text = random_tree(seed, 40).replace("contype='1'", "contype='0'").replace("damping", "range='-20 20' damping")
+    model = exact(mujoco.MjModel.from_xml_string(text))
+    readout = {"velocity": ("cvel", slice(None))}
+    made_of, rows = tables(model, 2, readout), anywhere(model, 30, 0.5, 2.0)
+    assert (threads.obstacle(made_of), threads.lanes(made_of)) == (None, 64)
     check(model, made_of, rows, tuple(by_c(model, rows, substeps, readout) for substeps in (0, 2)), 0.9)
 
 
