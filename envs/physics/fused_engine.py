@@ -1,8 +1,8 @@
 """The `fused` engine: the whole control step as one function of a batch, compiled for the model.
 
 On CPUs the worlds are lanes of the machine's vectors, and threads of XLA's own pool step groups of them. Numbers inside
-are double, whatever the arrays are. On NVIDIA GPUs a world is a warp of 32 threads, which hold
-two dofs each of a wide model, and all numbers are single; sums have one order there too, so runs repeat bit for bit.
+are double, whatever the arrays are. On NVIDIA GPUs a world is a warp of 32 threads, which hold two dofs each of a wide
+model, and all numbers are single; sums have one order there too, so runs repeat bit for bit.
 """
 
 # mujoco is a binary module without stubs:

@@ -8,6 +8,7 @@ DEVICE bool is_sound(const float* x, int size, int lane) {
 }
 
 // Arguments: the arrays' addresses, batches of rows. Readouts follow in the order of the tables.
+// Of wide models memory has room for few worlds at a time, so their threads may have more registers.
 extern "C" __global__ void __launch_bounds__(THREADS, BLOCKS * THREADS / LANES)
 fused_step(const float* __restrict__ qpos, const float* __restrict__ qvel, const float* __restrict__ warmstart,
            const float* __restrict__ ctrl, float* new_qpos, float* new_qvel, float* new_warmstart,

@@ -192,8 +192,8 @@ struct PerLane {
   MEMBER const X& operator[](int held) const { return value[held]; }
 };
 
-// Across lanes. Every sum has one order, so that runs repeat bit for bit. A ballot is of the first 32 lanes: no other has
-// a contact.
+// Across lanes. Every sum has one order, so that runs repeat bit for bit. A ballot is of the first 32 lanes: the others
+// have no contact.
 #ifdef __CUDACC__
 DEVICE real sum(const PerLane<real>& x) {
   real y = x[0];

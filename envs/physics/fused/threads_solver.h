@@ -3,7 +3,7 @@
 #include "threads_contacts.h"
 
 constexpr int LINE_SEARCH_STEPS = 12;
-constexpr real IMPROVEMENT = sizeof(real) == 4 ? real(1e-9) : real(1e-12);  // the least worth a step, as lanes_solver.h has it
+constexpr real IMPROVEMENT = sizeof(real) == 4 ? real(1e-9) : real(1e-12);  // as in lanes_solver.h
 
 // M x of a lane's dof.
 DEVICE real times_inertia(const World& w, const real* x, int dof) {

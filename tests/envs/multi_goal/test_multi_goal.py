@@ -436,13 +436,14 @@ def test_auto_takes_fused_where_it_has_room():
     assert envs.make("multi_goal_ant_2", wiring="own", num_agents=8).engine == "mujoco"
 
 
-def test_what_can_step_it_is_asked_of_the_model_with_slots(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("robot", ["point", "ant"])
+def test_what_can_step_it_is_asked_of_the_model_with_slots(robot: str, monkeypatch: pytest.MonkeyPatch):
     """The picture's model has all vases, too many for one warp of a GPU."""
 
     class Gpu:
         platform, device_kind = "gpu", "NVIDIA H200"
 
-    env = envs.make("multi_goal_point_2", physics="mujoco")
+    env = envs.make(f"multi_goal_{robot}_2", physics="mujoco")
     monkeypatch.setattr(jax, "devices", lambda: [Gpu])
     monkeypatch.setattr(contract, "installed_version", lambda _: f"{contract.MUJOCO_SERIES}.0")
     monkeypatch.setattr(nvrtc, "obstacle", lambda: None)
