@@ -132,10 +132,13 @@ def as_harm(files: pathlib.Path) -> str:
     scores = [[measures(run)["training"] for run in pair] for pair in found]
     p = holm([welch_test(ours, theirs) for theirs, ours in scores])
     several = len({share(pair[0]) for pair in found}) > 1
-    lines = [(pair[0]["task"], share(pair[0]), _limit(pair[0])) for pair in found]
+    kinds = [(theirs["task"], share(theirs), _limit(theirs)) for theirs, _ in found]
+    least: dict[tuple[str, float, float], float] = {}
+    for kind, (theirs, _) in zip(kinds, scores, strict=True):
+        least[kind] = min(theirs.mean(), least.get(kind, np.inf))
     body = []
-    for line, name, pair, (theirs, ours), corrected in zip(lines, line_names(found), found, scores, p, strict=True):
-        if theirs.mean() > min(x.mean() for of, (x, _) in zip(lines, scores, strict=True) if of == line):
+    for kind, name, pair, (theirs, ours), corrected in zip(kinds, line_names(found), found, scores, p, strict=True):
+        if theirs.mean() > least[kind]:
             continue
         line = [name, *[f"{share(pair[0]):g}"] * several, mean_sd(theirs), mean_sd(ours), _change(ours, theirs)]
         body.append([*line, p_value(corrected), ", ".join(map(unsafe, pair))])
